@@ -1,0 +1,6 @@
+"""`python -m snarfcli` is the `snarf` command."""
+
+from snarfcli.cli import main
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,19 @@
+"""Skeletons and bodies: rotations, forward kinematics, SMPL-format models, the built-in body (CC0-1.0)."""
+
+from snarfcli.bodies.body import Body, PosedBody, builtin_body, load_body
+from snarfcli.bodies.kinematics import axis_angle_to_matrix, forward_kinematics, invert_rigid, matrix_to_axis_angle
+from snarfcli.bodies.skeleton import SMPL_JOINT_NAMES, Skeleton, legs_apart_pose
+
+__all__ = [
+    "SMPL_JOINT_NAMES",
+    "Body",
+    "PosedBody",
+    "Skeleton",
+    "axis_angle_to_matrix",
+    "builtin_body",
+    "forward_kinematics",
+    "invert_rigid",
+    "legs_apart_pose",
+    "load_body",
+    "matrix_to_axis_angle",
+]

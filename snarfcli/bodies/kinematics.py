@@ -1,0 +1,144 @@
+"""Rotations as axis-angle vectors, and forward kinematics of a joint tree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+__all__ = ["axis_angle_to_matrix", "forward_kinematics", "invert_rigid", "matrix_to_axis_angle"]
+
+# Below this squared angle the series to t^8 is used: its first missing term, t^10 / 11!, is then under 3e-18.
+_SMALL_ANGLE_SQUARED = 1e-2
+
+
+def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
+    """Turn axis-angle vectors into rotation matrices (Rodrigues' formula), smoothly through zero.
+
+    Args:
+        axis_angle: [..., 3] rotation axis times angle, radians, float32 or float64.
+
+    Returns:
+        [..., 3, 3] rotation matrices, same dtype and device; differentiable everywhere, at zero too.
+
+    Raises:
+        ValueError: the last dimension is not 3.
+    """
+    if axis_angle.shape[-1:] != (3,):
+        raise ValueError(f"axis_angle: wanted shape [..., 3], got {list(axis_angle.shape)}")
+    squared = axis_angle.square().sum(-1)
+    is_small = squared < _SMALL_ANGLE_SQUARED
+    # The branch not taken must stay finite too, or its gradient would be nan times zero.
+    angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
+    s = squared
+    sin_over = torch.where(is_small, 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72))), torch.sin(angle) / angle)
+    # (1 - cos t) / t^2 through the half angle, which loses no digits
+    half = torch.sin(angle / 2) / angle
+    cos_over = torch.where(is_small, 0.5 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90)))), 2 * half * half)
+    x, y, z = axis_angle.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    outer = axis_angle[..., :, None] * axis_angle[..., None, :]
+    eye = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    # K^2 = v v^T - |v|^2 I
+    sin_over, cos_over, s = (factor[..., None, None] for factor in (sin_over, cos_over, s))
+    return (1 - cos_over * s) * eye + sin_over * cross + cos_over * outer
+
+
+def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
+    """Turn rotation matrices into axis-angle vectors of length at most pi.
+
+    Args:
+        matrix: [..., 3, 3] rotation matrices, float32 or float64.
+
+    Returns:
+        [..., 3] axis times angle, radians. Accurate at 0 and at pi: the quaternion is built from its
+        largest component.
+
+    Raises:
+        ValueError: the last two dimensions are not 3 x 3.
+    """
+    if matrix.shape[-2:] != (3, 3):
+        raise ValueError(f"matrix: wanted shape [..., 3, 3], got {list(matrix.shape)}")
+    m = matrix.flatten(-2)
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = m.unbind(-1)
+    # Row k is 4 q_k times the quaternion (w, x, y, z).
+    rows = torch.stack(
+        [
+            torch.stack([1 + m00 + m11 + m22, m21 - m12, m02 - m20, m10 - m01], -1),
+            torch.stack([m21 - m12, 1 + m00 - m11 - m22, m10 + m01, m02 + m20], -1),
+            torch.stack([m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12], -1),
+            torch.stack([m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22], -1),
+        ],
+        -2,
+    )
+    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    quaternion = torch.take_along_dim(rows, largest[..., None, None], -2).squeeze(-2)
+    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
+    quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+    w, v = quaternion[..., 0], quaternion[..., 1:]
+    squared = v.square().sum(-1)
+    is_small = squared < 1e-12
+    sine = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
+    # 2 atan(s / w) / s = 2 / w + O(s^2) near the identity
+    scale = torch.where(is_small, 2 / torch.where(is_small, w, torch.ones_like(w)), 2 * torch.atan2(sine, w) / sine)
+    return scale[..., None] * v
+
+
+def invert_rigid(transform: Tensor) -> Tensor:
+    """Invert rigid transforms [..., 4, 4] exactly, by the transposed rotation."""
+    rotation_t = transform[..., :3, :3].transpose(-1, -2)
+    translation = -(rotation_t @ transform[..., :3, 3:])
+    return torch.cat([torch.cat([rotation_t, translation], -1), transform[..., 3:, :]], -2)
+
+
+def forward_kinematics(
+    pose: Tensor, joints_rest: Tensor, parents: Sequence[int], translation: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Pose a joint tree.
+
+    Args:
+        pose: [B, J, 3] rotation of each joint relative to its parent, axis-angle, radians; joint 0 is the
+            global orientation.
+        joints_rest: [J, 3] or [B, J, 3] joint positions in the rest pose, metres.
+        parents: J parents, -1 for the root; a parent comes before its children.
+        translation: [B, 3] added to every joint, metres; none by default: the root joint stands at
+            joints_rest[0] + translation.
+
+    Returns:
+        joints_posed [B, J, 3], and posed_from_rest [B, J, 4, 4], which moves a point of the rest pose with each bone.
+
+    Raises:
+        ValueError: a shape does not match, or a parent does not come before its child.
+    """
+    joints = len(parents)
+    if pose.ndim != 3 or pose.shape[1:] != (joints, 3):
+        raise ValueError(f"pose: wanted shape [B, {joints}, 3], got {list(pose.shape)}")
+    batch = pose.shape[0]
+    if joints_rest.shape not in ((joints, 3), (batch, joints, 3)):
+        raise ValueError(
+            f"joints_rest: wanted shape [{joints}, 3] or [{batch}, {joints}, 3], got {list(joints_rest.shape)}"
+        )
+    if translation is not None and translation.shape != (batch, 3):
+        raise ValueError(f"translation: wanted shape [{batch}, 3], got {list(translation.shape)}")
+    if any(not -1 <= parent < joint for joint, parent in enumerate(parents)) or parents[0] != -1:
+        raise ValueError("parents: every parent must come before its child, and joint 0 must be the root (-1)")
+    rest = joints_rest.expand(batch, joints, 3)
+    local = axis_angle_to_matrix(pose)
+    rotations: list[Tensor] = []
+    positions: list[Tensor] = []
+    for joint, parent in enumerate(parents):
+        if parent < 0:
+            rotations.append(local[:, joint])
+            positions.append(rest[:, joint] if translation is None else rest[:, joint] + translation)
+        else:
+            offset = rest[:, joint] - rest[:, parent]
+            rotations.append(rotations[parent] @ local[:, joint])
+            positions.append(positions[parent] + (rotations[parent] @ offset[..., None]).squeeze(-1))
+    rotation = torch.stack(rotations, 1)
+    joints_posed = torch.stack(positions, 1)
+    offset = joints_posed - (rotation @ rest[..., None]).squeeze(-1)
+    top = torch.cat([rotation, offset[..., None]], -1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(batch, joints, 1, 4)
+    return joints_posed, torch.cat([top, bottom], -2)

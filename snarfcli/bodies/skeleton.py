@@ -1,0 +1,121 @@
+"""The joint tree of one subject, and the pose in which its avatar is learned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from snarfcli.bodies.kinematics import forward_kinematics, invert_rigid
+
+__all__ = ["CANONICAL_HIP_RAD", "SMPL_JOINT_NAMES", "Skeleton", "legs_apart_pose"]
+
+SMPL_JOINT_NAMES = (
+    "pelvis", "l_hip", "r_hip", "spine1", "l_knee", "r_knee", "spine2", "l_ankle", "r_ankle", "spine3",
+    "l_foot", "r_foot", "neck", "l_collar", "r_collar", "head", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow",
+    "l_wrist", "r_wrist", "l_hand", "r_hand",
+)  # fmt: skip
+
+CANONICAL_HIP_RAD = torch.pi / 6
+"""How far each leg is turned outwards in the canonical pose (SNARF's released code: 30 degrees)."""
+
+
+def legs_apart_pose(names: tuple[str, ...], dtype: torch.dtype = torch.float32) -> Tensor:
+    """Return the pose [J, 3] that spreads the legs of a T-posed body (y up, facing +z); zero without hips.
+
+    Apart, the legs share no neighbourhood, so that skinning weights learned on one do not bleed into the other.
+    """
+    pose = torch.zeros(len(names), 3, dtype=dtype)
+    for name, sign in (("l_hip", 1.0), ("r_hip", -1.0)):  # left is +x: turning about +z moves a hanging leg towards +x
+        if name in names:
+            pose[names.index(name), 2] = sign * CANONICAL_HIP_RAD
+    return pose
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A joint tree with its rest joints and its canonical pose."""
+
+    names: tuple[str, ...]
+    """J joint names, left and right ones starting with `l_` and `r_`."""
+    parents: tuple[int, ...]
+    """J parents, -1 for the root; a parent comes before its children."""
+    joints_rest: Tensor
+    """[J, 3] joint positions in the rest pose, metres."""
+    canonical_pose: Tensor
+    """[J, 3] pose of the canonical frame relative to the rest pose, axis-angle, radians."""
+
+    def __post_init__(self) -> None:
+        joints = len(self.parents)
+        for name in ("joints_rest", "canonical_pose"):
+            if getattr(self, name).shape != (joints, 3):
+                raise ValueError(f"{name}: wanted shape [{joints}, 3], got {list(getattr(self, name).shape)}")
+        if len(self.names) != joints:
+            raise ValueError(f"names: wanted {joints} names, one per parent, got {len(self.names)}")
+
+    @property
+    def num_joints(self) -> int:
+        """J, the number of joints, which is also the number of bones."""
+        return len(self.parents)
+
+    @property
+    def bones(self) -> list[tuple[int, int]]:
+        """Pairs (parent, child) of joints, one for each joint but the root."""
+        return [(parent, joint) for joint, parent in enumerate(self.parents) if parent >= 0]
+
+    @property
+    def left_right(self) -> tuple[int, ...]:
+        """For each joint the one on the other side; a joint without a counterpart maps to itself."""
+        other = {"l": "r_", "r": "l_"}
+        mirrored = (other[name[0]] + name[2:] if name[:2] in ("l_", "r_") else name for name in self.names)
+        return tuple(self.names.index(m) if m in self.names else j for j, m in enumerate(mirrored))
+
+    @property
+    def canonical_joints(self) -> Tensor:
+        """[J, 3] joint positions in the canonical frame, metres."""
+        return forward_kinematics(self.canonical_pose[None], self.joints_rest, self.parents)[0][0]
+
+    def posed_from_rest(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
+        """Return the bone transforms [B, J, 4, 4] from the rest pose to `pose` [B, J, 3]."""
+        return forward_kinematics(pose, self.joints_rest.to(pose), self.parents, translation)[1]
+
+    def posed_from_canonical(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
+        """Return the bone transforms from the canonical frame to a pose (SNARF's B_j, Eq. 4).
+
+        Args:
+            pose: [B, J, 3] axis-angle, radians, global orientation included; the result has its dtype and device.
+            translation: [B, 3] metres, none by default.
+
+        Returns:
+            [B, J, 4, 4] rigid transforms, metres.
+        """
+        canonical_from_rest = self.posed_from_rest(self.canonical_pose[None].to(pose))
+        return self.posed_from_rest(pose, translation) @ invert_rigid(canonical_from_rest)
+
+    def to(self, *args: Any, **kwargs: Any) -> Skeleton:
+        """Move both tensors as `Tensor.to` does."""
+        return Skeleton(
+            self.names, self.parents, self.joints_rest.to(*args, **kwargs), self.canonical_pose.to(*args, **kwargs)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and tensors, which `torch.load(weights_only=True)` reads back."""
+        return {
+            "names": list(self.names),
+            "parents": list(self.parents),
+            "joints_rest": self.joints_rest.detach().cpu(),
+            "canonical_pose": self.canonical_pose.detach().cpu(),
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Skeleton:
+        """Make the skeleton that `to_dict` described; arrays and lists are read too."""
+        return cls(
+            names=tuple(str(name) for name in content["names"]),
+            parents=tuple(int(parent) for parent in content["parents"]),
+            joints_rest=torch.as_tensor(content["joints_rest"]),
+            canonical_pose=torch.as_tensor(content["canonical_pose"]),
+        )

@@ -1,0 +1,21 @@
+"""Forward skinning for neural fields: the weight grid, the correspondence search and its exact gradient.
+
+Usable alone, in any neural field: see `ForwardDeformer`.
+"""
+
+from snarfcli.deformer.correspondences import Correspondences, find_correspondences
+from snarfcli.deformer.deformer import ForwardDeformer, SkinningConfig
+from snarfcli.deformer.grid import CanonicalGrid
+from snarfcli.deformer.search import SearchConfig
+from snarfcli.deformer.skinning import blend_transforms, skin
+
+__all__ = [
+    "CanonicalGrid",
+    "Correspondences",
+    "ForwardDeformer",
+    "SearchConfig",
+    "SkinningConfig",
+    "blend_transforms",
+    "find_correspondences",
+    "skin",
+]

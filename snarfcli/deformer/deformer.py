@@ -1,0 +1,149 @@
+"""The forward-skinning module: a weight field on a grid, posed points in, canonical correspondences out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from snarfcli.deformer.correspondences import Correspondences, find_correspondences
+from snarfcli.deformer.grid import CanonicalGrid, cell_corners
+from snarfcli.deformer.search import SearchConfig
+from snarfcli.deformer.skinning import interpolate, skin
+from snarfcli.deformer.weights import DistilledWeights
+
+__all__ = ["ForwardDeformer", "SkinningConfig"]
+
+
+@dataclass
+class SkinningConfig:
+    name: str = "distilled"
+    """Weight field: distilled (a network evaluated at the grid nodes)."""
+    resolution: list[int] = field(default_factory=lambda: [64, 64, 16])
+    """Grid nodes along x, y, z."""
+    margin_m: list[float] = field(default_factory=lambda: [0.12, 0.12, 0.20])
+    """What the grid's box adds around the canonical body on either side, along x, y, z, metres."""
+    active_radius_m: float | None = 0.22
+    """Cells with a corner this near to a bone are searched, metres; null searches every cell."""
+    width: int = 128
+    """Width of the network's hidden layers."""
+    depth: int = 4
+    """Number of hidden layers."""
+    sharpness: float = 20.0
+    """Factor before the softmax over the bones."""
+    weight_norm: bool = True
+    """Whether the network's layers are weight-normalised."""
+
+
+class ForwardDeformer(nn.Module):
+    """Find the canonical correspondences of posed points under learned forward skinning.
+
+    Args:
+        grid: canonical box of the weight grid.
+        bones: canonical positions of the bones' ends, [S, 2, 3], metres; they say where the body may be.
+        num_bones: J, the number of bone transforms.
+        skinning: the weight field.
+        search: how correspondences are found.
+    """
+
+    def __init__(
+        self, grid: CanonicalGrid, bones: Tensor, num_bones: int, skinning: SkinningConfig, search: SearchConfig
+    ) -> None:
+        super().__init__()
+        self.search = search
+        self.num_bones = num_bones
+        width, height, depth = skinning.resolution
+        self.shape = (depth, height, width)
+        self.field = DistilledWeights(
+            num_bones, grid, skinning.width, skinning.depth, skinning.sharpness, skinning.weight_norm
+        )
+        self.register_buffer("lower", grid.lower.clone())
+        self.register_buffer("upper", grid.upper.clone())
+        self.register_buffer("active_cells", cells_near_bones(grid, self.shape, bones, skinning.active_radius_m))
+        self._frozen: Tensor | None = None
+
+    @property
+    def grid(self) -> CanonicalGrid:
+        """The box of the weight grid."""
+        return CanonicalGrid(self.lower, self.upper)
+
+    def weight_grid(self) -> Tensor:
+        """Return the skinning weights at the grid nodes, [D, H, W, J].
+
+        In training with a complete search only the nodes of active cells are evaluated; the others are never read.
+        """
+        if self._frozen is not None:
+            return self._frozen
+        nodes = self.grid.nodes(self.shape).reshape(-1, 3)
+        if not (self.training and self.search.name == "complete"):
+            return self.field(nodes).reshape(*self.shape, -1)
+        used = cell_corners(self.active_cells.reshape(-1).nonzero()[:, 0], self.shape).unique()
+        weights = nodes.new_zeros(len(nodes), self.num_bones).index_copy(0, used, self.field(nodes[used]))
+        return weights.reshape(*self.shape, -1)
+
+    def freeze(self) -> ForwardDeformer:
+        """Evaluate the weight grid once and keep it; call this after training. `train()` undoes it."""
+        self.eval()
+        self._frozen = None
+        with torch.no_grad():
+            self._frozen = self.weight_grid()
+        return self
+
+    def train(self, mode: bool = True) -> ForwardDeformer:
+        """Switch between training and evaluation; either way a frozen weight grid is forgotten."""
+        self._frozen = None
+        return super().train(mode)
+
+    def _apply(self, fn, recurse=True):
+        self._frozen = None
+        return super()._apply(fn, recurse)
+
+    def forward(self, points: Tensor, bone_transforms: Tensor) -> Correspondences:
+        """Find the correspondences of posed points [B, N, 3] under bone transforms [B, J, 4, 4], canonical to posed."""
+        complete = self.search.name == "complete"
+        return find_correspondences(
+            points,
+            bone_transforms,
+            self.weight_grid(),
+            self.grid,
+            search=self.search.name,
+            init_bones=self.search.init_bones,
+            active_cells=self.active_cells if complete else None,
+            tolerance=self.search.tolerance,
+            max_steps=self.search.max_steps,
+            divergence=self.search.divergence,
+            jacobian=self.search.jacobian,
+        )
+
+    def skinning_weights(self, canonical: Tensor) -> Tensor:
+        """Return the grid's skinning weights [N, J] at canonical points [N, 3]."""
+        return interpolate(self.weight_grid(), canonical, self.grid)
+
+    def skin(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
+        """Move canonical points [N, 3] into one pose [J, 4, 4]; the exact inverse of the search on the grid."""
+        return skin(canonical, self.skinning_weights(canonical), bone_transforms)
+
+
+def cells_near_bones(
+    grid: CanonicalGrid, shape: tuple[int, int, int], bones: Tensor, radius: float | None
+) -> Tensor:
+    """Return which cells have a corner within `radius` metres of a bone, bool [D-1, H-1, W-1]; all for None."""
+    cells = [n - 1 for n in shape]
+    if radius is None:
+        return torch.ones(cells, dtype=torch.bool)
+    near = (distance_to_segments(grid.nodes(shape).reshape(-1, 3), bones) < radius).reshape(1, 1, *shape)
+    return torch.nn.functional.max_pool3d(near.float(), 2, stride=1)[0, 0] > 0
+
+
+def distance_to_segments(points: Tensor, segments: Tensor) -> Tensor:
+    """Return the distance of points [N, 3] to the nearest of the segments [S, 2, 3], [N], metres."""
+    start = segments[:, 0]
+    along = segments[:, 1] - start
+    length = (along * along).sum(1).clamp_min(1e-12)
+    # |p - a - t(b - a)|^2 written out by dot products, so that the largest array is [N, S] and not [N, S, 3].
+    from_start = points @ along.T - (start * along).sum(1)
+    share = (from_start / length).clamp(0, 1)
+    to_start = (points * points).sum(1, keepdim=True) - 2 * points @ start.T + (start * start).sum(1)
+    squared = to_start - 2 * share * from_start + share * share * length
+    return squared.amin(1).clamp_min(1e-12).sqrt()

@@ -1,0 +1,104 @@
+"""The canonical voxel grid: where its nodes are, and trilinear interpolation between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["CORNERS", "CanonicalGrid", "cell_corners", "locate", "trilinear_gradients", "trilinear_weights"]
+
+# Corner k of a cell lies at (k & 1, k >> 1 & 1, k >> 2 & 1) along (x, y, z).
+CORNERS = torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])
+
+
+@dataclass(frozen=True)
+class CanonicalGrid:
+    """An axis-aligned box in canonical space whose outermost grid nodes lie on its corners.
+
+    The number of nodes is not kept here: it is the shape [D, H, W] (z, y, x) of whatever array is laid over the box.
+    """
+
+    lower: Tensor
+    """Corner with the smallest coordinates, [3], metres."""
+    upper: Tensor
+    """Corner with the largest coordinates, [3], metres."""
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper"):
+            if tuple(getattr(self, name).shape) != (3,):
+                raise ValueError(f"grid.{name} must have shape [3], got {list(getattr(self, name).shape)}")
+        if not bool((self.upper > self.lower).all()):
+            raise ValueError(f"grid.upper must exceed grid.lower, got {self.lower.tolist()} and {self.upper.tolist()}")
+
+    @classmethod
+    def around(cls, points: Tensor, margin: Sequence[float]) -> CanonicalGrid:
+        """Return the box of `points` [N, 3] widened by `margin` (x, y, z) on either side, metres."""
+        widen = torch.as_tensor(margin, dtype=points.dtype, device=points.device)
+        return cls(points.amin(0) - widen, points.amax(0) + widen)
+
+    @property
+    def longest_side(self) -> float:
+        """Length of the longest side, metres."""
+        return float((self.upper - self.lower).max())
+
+    def to(self, like: Tensor) -> CanonicalGrid:
+        """Return the same box with the dtype and on the device of `like`."""
+        return CanonicalGrid(self.lower.to(like), self.upper.to(like))
+
+    def cell_size(self, shape: Sequence[int]) -> Tensor:
+        """Return the sides of one cell along x, y, z, [3], metres, for nodes laid out as `shape` = (D, H, W)."""
+        cells = torch.tensor([shape[2] - 1, shape[1] - 1, shape[0] - 1]).to(self.lower)
+        return (self.upper - self.lower) / cells
+
+    def nodes(self, shape: Sequence[int]) -> Tensor:
+        """Return the canonical positions of the nodes, [D, H, W, 3], metres."""
+        axes = [torch.linspace(0, 1, n).to(self.lower) for n in shape]
+        z, y, x = torch.meshgrid(*axes, indexing="ij")
+        return self.lower + torch.stack([x, y, z], -1) * (self.upper - self.lower)
+
+
+def cell_corners(cells: Tensor, shape: Sequence[int]) -> Tensor:
+    """Return the flat node indices [..., 8] of the corners of `cells`, given as flat cell indices [...].
+
+    Cells are numbered x fastest in a (D-1, H-1, W-1) array, nodes x fastest in `shape` = (D, H, W).
+    """
+    depth, height, width = shape
+    x = cells % (width - 1)
+    y = cells // (width - 1) % (height - 1)
+    z = cells // ((width - 1) * (height - 1))
+    first = (z * height + y) * width + x
+    corners = CORNERS.to(cells.device)
+    offsets = (corners[:, 2] * height + corners[:, 1]) * width + corners[:, 0]
+    return first[..., None] + offsets
+
+
+def locate(points: Tensor, grid: CanonicalGrid, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Return the flat cell index [N] that holds each canonical point [N, 3], and its coordinates [N, 3] in that cell.
+
+    Coordinates run from 0 to 1 inside a cell; a point outside the grid gets the nearest cell and coordinates beyond.
+    """
+    cells = torch.tensor([shape[2] - 1, shape[1] - 1, shape[0] - 1], device=points.device)
+    scaled = (points - grid.lower) / grid.cell_size(shape)
+    index = scaled.detach().floor().long().clamp_min(0).minimum(cells - 1)
+    return (index[..., 2] * cells[1] + index[..., 1]) * cells[0] + index[..., 0], scaled - index
+
+
+def trilinear_weights(local: Tensor) -> Tensor:
+    """Return the weights [..., 8] of a cell's corners at coordinates `local` [..., 3] in the cell."""
+    x, y, z = local.unbind(-1)
+    x0, y0, z0 = 1 - x, 1 - y, 1 - z
+    xy = torch.stack([x0 * y0, x * y0, x0 * y, x * y], -1)
+    return torch.cat([xy * z0[..., None], xy * z[..., None]], -1)
+
+
+def trilinear_gradients(local: Tensor) -> Tensor:
+    """Return the derivatives [..., 3, 8] of `trilinear_weights` by the coordinates in the cell."""
+    x, y, z = local.unbind(-1)
+    x0, y0, z0 = 1 - x, 1 - y, 1 - z
+    by_x = torch.stack([-y0 * z0, y0 * z0, -y * z0, y * z0, -y0 * z, y0 * z, -y * z, y * z], -1)
+    by_y = torch.stack([-x0 * z0, -x * z0, x0 * z0, x * z0, -x0 * z, -x * z, x0 * z, x * z], -1)
+    by_z = torch.stack([-x0 * y0, -x * y0, -x0 * y, -x * y, x0 * y0, x * y0, x0 * y, x * y], -1)
+    return torch.stack([by_x, by_y, by_z], -2)

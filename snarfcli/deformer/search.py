@@ -1,0 +1,81 @@
+"""What the searches share: their settings, the set of roots they return, and small linear algebra."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["Roots", "SearchConfig", "drop_duplicates", "invert_3x3"]
+
+
+@dataclass
+class SearchConfig:
+    name: str = "complete"
+    """Which search: complete (every root, cell by cell) or broyden (the papers')."""
+    init_bones: list[int] | None = None
+    """Bones whose inverse transforms start a broyden search; null means all bones."""
+    jacobian: str = "exact"
+    """Inverse Jacobian at broyden's roots: exact, or broyden for the approximation of the papers."""
+    tolerance: float = 5e-6
+    """Largest residual of a root, as a share of the longest side of the canonical grid."""
+    max_steps: int = 10
+    """Most steps of Newton's or Broyden's method for one start."""
+    divergence: float = 0.25
+    """Residual at which a broyden start is given up, as a share of the longest side of the canonical grid."""
+
+
+@dataclass
+class Roots:
+    """Roots of d(x) = x' for the queries of several poses, before gradients are attached."""
+
+    canonical: Tensor
+    """[M, 3], metres."""
+    query: Tensor
+    """Flat index b * N + n of each root's query, [M], ascending."""
+    jacobian_inverse: Tensor
+    """Inverse of dd/dx at the root, [M, 3, 3]."""
+    cell: Tensor
+    """Flat grid cell of each root, [M]."""
+    local: Tensor
+    """Coordinates in that cell, [M, 3]."""
+
+    @classmethod
+    def concatenate(cls, parts: list[Roots]) -> Roots:
+        """Join the roots of consecutive queries."""
+        fields = ("canonical", "query", "jacobian_inverse", "cell", "local")
+        return cls(*(torch.cat([getattr(part, field) for part in parts]) for field in fields))
+
+    def take(self, index: Tensor) -> Roots:
+        """Return the roots at `index` [K]."""
+        return Roots(*(field[index] for field in vars(self).values()))
+
+
+def invert_3x3(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Return inverses [M, 3, 3] and determinants [M] of 3x3 matrices; a singular matrix gives infinities or NaN.
+
+    Cofactors by cross products: many times faster than a batched LU factorisation, and never in reduced precision.
+    """
+    a, b, c = matrix.unbind(1)
+    cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], 2)
+    determinant = (a * cofactors[:, :, 0]).sum(1)
+    return cofactors / determinant[:, None, None], determinant
+
+
+def drop_duplicates(roots: Roots, distance: float) -> Roots:
+    """Sort roots by query and keep one of those of the same query that lie closer together than `distance`, metres.
+
+    Neighbouring cells both report a root on their common face, and several starts reach the same root.
+    """
+    order = torch.argsort(roots.query, stable=True)
+    roots = roots.take(order)
+    keep = torch.ones(len(order), dtype=torch.bool, device=order.device)
+    # Roots of one query stand side by side, so comparing each with the k-th before it, for growing k, meets all pairs.
+    for k in range(1, len(order)):
+        same = roots.query[k:] == roots.query[:-k]
+        if not bool(same.any()):
+            break
+        close = (roots.canonical[k:] - roots.canonical[:-k]).norm(dim=1) < distance
+        keep[k:] &= ~(same & close & keep[:-k])
+    return roots.take(keep.nonzero()[:, 0])

@@ -1,0 +1,79 @@
+"""Linear blend skinning, pointwise and blended once per grid node."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_gradients, trilinear_weights
+
+__all__ = ["blend_transforms", "forward_jacobian", "interpolate", "skin"]
+
+
+def skin(canonical: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
+    """Move canonical points into the posed frame by linear blend skinning.
+
+    Args:
+        canonical: points [N, 3], canonical frame, metres.
+        weights: skinning weights [N, J], non-negative, rows sum to 1.
+        bone_transforms: [J, 4, 4], canonical to posed, metres.
+
+    Returns:
+        Posed points [N, 3], metres.
+
+    Source: SNARF Eq. 4.
+    """
+    blended = (weights @ bone_transforms[:, :3].reshape(len(bone_transforms), 12)).reshape(-1, 3, 4)
+    return (blended[:, :, :3] @ canonical[:, :, None])[:, :, 0] + blended[:, :, 3]
+
+
+def blend_transforms(skinning_weights: Tensor, bone_transforms: Tensor) -> Tensor:
+    """Blend the bone transforms once per grid node and pose.
+
+    Args:
+        skinning_weights: [D, H, W, J] at the grid nodes.
+        bone_transforms: [B, J, 4, 4], canonical to posed.
+
+    Returns:
+        The upper three rows of the blended transforms, flattened: [B, D * H * W, 12].
+
+    Source: Fast-SNARF Eq. 13.
+    """
+    bones = bone_transforms[:, :, :3].reshape(*bone_transforms.shape[:2], 12)
+    return torch.matmul(skinning_weights.reshape(1, -1, skinning_weights.shape[-1]), bones)
+
+
+def interpolate(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:
+    """Interpolate node values [D, H, W, C] at canonical points [N, 3]; points outside get the border's values.
+
+    Returns:
+        [N, C].
+    """
+    shape = values.shape[:3]
+    cell, local = locate(points, grid, shape)
+    corners = cell_corners(cell, shape)
+    phi = trilinear_weights(local.clamp(0, 1))
+    return (phi[..., None] * values.reshape(-1, values.shape[-1])[corners]).sum(-2)
+
+
+def forward_jacobian(corner_transforms: Tensor, local: Tensor, origin: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor]:
+    """Evaluate d(x) = T(x) [x; 1] and its exact Jacobian inside grid cells.
+
+    Args:
+        corner_transforms: blended transforms at the corners of each point's cell, [M, 8, 12].
+        local: coordinates in the cell, [M, 3], 0 to 1 inside.
+        origin: canonical position of the cell's first corner, [M, 3], metres.
+        cell_size: [3], metres.
+
+    Returns:
+        Posed points [M, 3], metres, and the derivatives [M, 3, 3] of the posed point by the *cell coordinates*
+        (divide column i by cell_size[i] for the derivative by the canonical point).
+
+    Source: SNARF Eq. 4 with T(x) trilinear (Fast-SNARF Sec. 4.1); product rule for the Jacobian.
+    """
+    phi = torch.cat([trilinear_weights(local)[:, None], trilinear_gradients(local)], 1)
+    blended = torch.bmm(phi, corner_transforms).reshape(-1, 4, 3, 4)
+    canonical = origin + local * cell_size
+    moved = (blended[..., :3] * canonical[:, None, None]).sum(-1) + blended[..., 3]  # T x, then dT/du_i x
+    jacobian = moved[:, 1:].transpose(1, 2) + blended[:, 0, :, :3] * cell_size
+    return moved[:, 0], jacobian

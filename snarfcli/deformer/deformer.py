@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
+from snarfcli.deformer.complete import posed_cell_boxes
 from snarfcli.deformer.correspondences import Correspondences, find_correspondences
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners
 from snarfcli.deformer.search import SearchConfig
-from snarfcli.deformer.skinning import interpolate, skin
+from snarfcli.deformer.skinning import blend_transforms, interpolate, skin
 from snarfcli.deformer.weights import DistilledWeights
+from snarfcli.segments import distance_to_segments
 
 __all__ = ["ForwardDeformer", "SkinningConfig"]
 
@@ -116,6 +118,14 @@ class ForwardDeformer(nn.Module):
             jacobian=self.search.jacobian,
         )
 
+    def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the corners (lower [3], upper [3]) of a posed box around the images of all active cells, metres."""
+        corners = cell_corners(self.active_cells.reshape(-1).nonzero()[:, 0], self.shape)
+        origins = self.grid.nodes(self.shape).reshape(-1, 3)[corners[:, 0]]
+        transforms = blend_transforms(self.weight_grid(), bone_transforms[None])[0][corners]
+        lower, upper = posed_cell_boxes(transforms, origins, self.grid.cell_size(self.shape))
+        return lower.amin(0).cpu(), upper.amax(0).cpu()
+
     def skinning_weights(self, canonical: Tensor) -> Tensor:
         """Return the grid's skinning weights [N, J] at canonical points [N, 3]."""
         return interpolate(self.weight_grid(), canonical, self.grid)
@@ -134,16 +144,3 @@ def cells_near_bones(
         return torch.ones(cells, dtype=torch.bool)
     near = (distance_to_segments(grid.nodes(shape).reshape(-1, 3), bones) < radius).reshape(1, 1, *shape)
     return torch.nn.functional.max_pool3d(near.float(), 2, stride=1)[0, 0] > 0
-
-
-def distance_to_segments(points: Tensor, segments: Tensor) -> Tensor:
-    """Return the distance of points [N, 3] to the nearest of the segments [S, 2, 3], [N], metres."""
-    start = segments[:, 0]
-    along = segments[:, 1] - start
-    length = (along * along).sum(1).clamp_min(1e-12)
-    # |p - a - t(b - a)|^2 written out by dot products, so that the largest array is [N, S] and not [N, S, 3].
-    from_start = points @ along.T - (start * along).sum(1)
-    share = (from_start / length).clamp(0, 1)
-    to_start = (points * points).sum(1, keepdim=True) - 2 * points @ start.T + (start * start).sum(1)
-    squared = to_start - 2 * share * from_start + share * share * length
-    return squared.amin(1).clamp_min(1e-12).sqrt()

@@ -1,0 +1,200 @@
+"""The avatar: a trained model with its skeleton, saved as one safe file."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from torch import Tensor
+
+from snarfcli.bodies import Skeleton
+from snarfcli.deformer import CanonicalGrid
+from snarfcli.errors import UserError
+from snarfcli.files import atomic_path
+from snarfcli.models.extent import bone_segments
+from snarfcli.models.fast_snarf import AvatarConfig, FastSnarf, FieldSamples
+
+if TYPE_CHECKING:
+    from snarfcli.meshing.mesh import Mesh
+
+__all__ = ["Avatar", "load_checkpoint"]
+
+FORMAT = "snarf-avatar"
+FORMAT_VERSION = 1
+_MODELS = {"fast_snarf": FastSnarf}
+
+
+class Avatar:
+    """An animatable avatar of one subject.
+
+    Args:
+        config: architecture.
+        skeleton: joint tree, rest joints and canonical pose.
+        grid: canonical box that holds the body.
+        facts: plain facts about its making (data, subject, steps, ...), saved with it.
+    """
+
+    def __init__(
+        self, config: AvatarConfig, skeleton: Skeleton, grid: CanonicalGrid, facts: dict[str, Any] | None = None
+    ) -> None:
+        if config.model.name not in _MODELS:
+            raise ValueError(f"model.name must be one of {', '.join(_MODELS)}, got {config.model.name!r}")
+        self.config = config
+        self.skeleton = skeleton
+        self.facts = dict(facts or {})
+        self.model = _MODELS[config.model.name](config, bone_segments(skeleton), skeleton.num_joints, grid)
+
+    # ---------------------------------------------------------------- files
+    def save(self, path: str | Path) -> None:
+        """Write the avatar to one file, whole or not at all; `torch.load(weights_only=True)` reads it."""
+        with atomic_path(path) as temporary:
+            torch.save(self.to_dict(), temporary)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain dicts, lists, numbers and tensors that describe the avatar completely."""
+        return {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "config": asdict(self.config),
+            "skeleton": self.skeleton.to_dict(),
+            "grid": {"lower": self.model.deformer.lower.cpu(), "upper": self.model.deformer.upper.cpu()},
+            "state": {name: value.detach().cpu().clone() for name, value in self.model.state_dict().items()},
+            "facts": self.facts,
+        }
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Avatar:
+        """Read an avatar and make it ready to use on `device`.
+
+        Raises:
+            UserError: the file is missing, damaged, no avatar, or of another format version.
+        """
+        return cls.from_dict(load_checkpoint(path, FORMAT, FORMAT_VERSION, "avatar"), path).to(device)
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any], path: str | Path = "avatar") -> Avatar:
+        """Build the avatar that `to_dict` described; `path` only names it in messages."""
+        try:
+            config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"]))
+            grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
+            avatar = cls(config, Skeleton.from_dict(content["skeleton"]), grid, content["facts"])
+            avatar.model.load_state_dict(content["state"])
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OmegaConfBaseException) as error:
+            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            raise UserError(f"{path} does not describe an avatar of this version ({reason}); train it again") from None
+        avatar.model.eval()
+        return avatar
+
+    def to(self, device: str | torch.device) -> Avatar:
+        """Move the avatar to a device and freeze its skinning weights there."""
+        self.model.to(device).eval()
+        self.model.deformer.freeze()
+        return self
+
+    @property
+    def device(self) -> torch.device:
+        """Where the avatar computes."""
+        return self.model.deformer.lower.device
+
+    # ---------------------------------------------------------------- the field
+    def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
+        """Return the bone transforms [B, J, 4, 4], canonical to posed, of pose [B, J, 3] and translation [B, 3]."""
+        joints = self.skeleton.num_joints
+        if pose.ndim != 3 or tuple(pose.shape[1:]) != (joints, 3):
+            raise ValueError(f"pose must have shape [B, {joints}, 3], got {list(pose.shape)}")
+        return self.skeleton.posed_from_canonical(pose, translation).to(self.device)
+
+    @torch.no_grad()
+    def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> FieldSamples:
+        """Evaluate the posed field at points [B, N, 3] under bone transforms [B, J, 4, 4] and pose [B, J, 3]."""
+        return self.model(points.to(self.device), bone_transforms.to(self.device), pose.to(self.device))
+
+    def occupancy(self, points: Tensor, pose: Tensor, translation: Tensor | None = None) -> Tensor:
+        """Return occupancy probabilities [B, N] at posed points [B, N, 3], metres.
+
+        Args:
+            points: [B, N, 3], posed space, metres.
+            pose: [B, J, 3] axis-angle, radians, global orientation included.
+            translation: [B, 3], metres.
+        """
+        return self.query(points, self.bone_transforms(pose, translation), pose).logits.sigmoid()
+
+    @torch.no_grad()
+    def canonical_logits(self, canonical: Tensor, pose: Tensor) -> Tensor:
+        """Return occupancy logits [N] at canonical points [N, 3] for the shape of one pose [J, 3]."""
+        condition = self.model.condition(pose[None].to(self.device))
+        index = torch.zeros(len(canonical), dtype=torch.long, device=self.device)
+        return self.model.canonical_logits(canonical.to(self.device), condition, index)
+
+    @torch.no_grad()
+    def skinning_weights(self, canonical: Tensor) -> Tensor:
+        """Return the learned skinning weights [N, J] at canonical points [N, 3]."""
+        return self.model.deformer.skinning_weights(canonical.to(self.device))
+
+    @torch.no_grad()
+    def skin(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
+        """Move canonical points [N, 3] into one pose, given by bone transforms [J, 4, 4]."""
+        return self.model.deformer.skin(canonical.to(self.device), bone_transforms.to(self.device))
+
+    def canonical_box(self) -> tuple[Tensor, Tensor]:
+        """Return the corners (lower [3], upper [3]) of the canonical box that holds the body, metres."""
+        return self.model.deformer.lower.cpu(), self.model.deformer.upper.cpu()
+
+    @torch.no_grad()
+    def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the corners of a posed box that holds the whole body in one pose [J, 4, 4], metres.
+
+        It bounds the images of all cells that the search looks into and that the body may fill.
+        """
+        return self.model.deformer.posed_box(bone_transforms.to(self.device))
+
+    def mesh(
+        self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field"
+    ) -> Mesh:
+        """Extract the posed mesh of one pose.
+
+        Args:
+            pose: [J, 3] or [1, J, 3] axis-angle, radians, global orientation included.
+            translation: [3] or [1, 3], metres.
+            resolution: voxels along the longest side.
+            surface: "field" (the union of all correspondences, watertight) or "skinned" (the canonical mesh moved by
+                linear blend skinning, with its weights).
+
+        Raises:
+            ValueError: `surface` is neither, or the field has no surface in this pose.
+        """
+        from snarfcli.meshing.surfaces import field_surface, skinned_surface
+
+        surfaces = {"field": field_surface, "skinned": skinned_surface}
+        if surface not in surfaces:
+            raise ValueError(f"surface must be 'field' or 'skinned', got {surface!r}")
+        pose = pose.reshape(-1, 3)
+        translation = None if translation is None else translation.reshape(3)
+        return surfaces[surface](self, pose, translation, resolution=resolution)
+
+
+def load_checkpoint(path: str | Path, file_format: str, version: int, what: str) -> dict[str, Any]:
+    """Read a dict written by `torch.save` without executing anything in it.
+
+    Raises:
+        UserError: the file is missing, damaged, of another kind or another version.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"no {what} at {path}; train one with \"snarf train\" or name another file")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile):
+        raise UserError(f"{what} {path} is truncated or is not a file of snarf; train it again or copy it again") from None
+    if not isinstance(content, dict) or content.get("format") != file_format:
+        raise UserError(f"{path} is not a snarf {what}; give the file that \"snarf train\" wrote")
+    if content.get("version") != version:
+        came = content.get("version")
+        raise UserError(f"{what} {path} has format version {came}, this snarf reads {version}; train it again")
+    return content

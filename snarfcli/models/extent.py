@@ -1,0 +1,39 @@
+"""Where a subject lies in the canonical frame, judged from posed meshes and the skeleton alone."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from snarfcli.bodies import Skeleton
+
+__all__ = ["bone_segments", "unpose_by_nearest_bone"]
+
+
+def bone_segments(skeleton: Skeleton, joints: Tensor | None = None) -> Tensor:
+    """Return the ends (parent, child) of the bones, [S, 2, 3], metres, in the canonical frame unless `joints` are given."""
+    joints = skeleton.canonical_joints if joints is None else joints
+    return torch.stack([torch.stack([joints[parent], joints[child]]) for parent, child in skeleton.bones])
+
+
+def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: Skeleton) -> Tensor:
+    """Move posed surface points rigidly back with their nearest bone: a rough canonical shape without skinning weights.
+
+    Args:
+        vertices: [V, 3], posed, metres.
+        bone_transforms: [J, 4, 4], canonical to posed.
+        skeleton: its bones.
+
+    Returns:
+        [V, 3], canonical frame, metres; wrong by a few centimetres near bent joints.
+    """
+    ends = bone_segments(skeleton).to(vertices)
+    movers = torch.tensor([parent for parent, _ in skeleton.bones])
+    moved = bone_transforms[movers]
+    posed = torch.einsum("src,sec->ser", moved[:, :3, :3], ends) + moved[:, None, :3, 3]
+    along = posed[:, 1] - posed[:, 0]
+    offset = vertices[:, None] - posed[:, 0]
+    share = ((offset * along).sum(-1) / (along * along).sum(-1).clamp_min(1e-12)).clamp(0, 1)
+    nearest = (offset - share[..., None] * along).norm(dim=-1).argmin(1)
+    inverse = torch.linalg.inv(moved)[nearest]
+    return (inverse[:, :3, :3] @ vertices[:, :, None])[:, :, 0] + inverse[:, :3, 3]

@@ -1,0 +1,134 @@
+"""Fast-SNARF: canonical occupancy moved by forward skinning on a weight grid (Fast-SNARF Sec. 3-4, SNARF Sec. 3)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from snarfcli.deformer import CanonicalGrid, Correspondences, ForwardDeformer, SearchConfig, SkinningConfig
+from snarfcli.precision import matmul_precision
+from snarfcli.shape import OccupancyNetwork, ShapeConfig
+
+__all__ = ["AvatarConfig", "FastSnarf", "FieldSamples", "ModelConfig", "NO_CORRESPONDENCE", "blend"]
+
+NO_CORRESPONDENCE = -30.0
+"""Logit of a point that no canonical point is moved onto: certainly outside."""
+
+_POINTS_AT_ONCE = 32_768  # canonical points in one call of the shape network; smaller calls stay in the cache
+
+
+@dataclass
+class ModelConfig:
+    name: str = "fast_snarf"
+    """Which system."""
+    blend: str = "logit"
+    """How correspondences of one point are blended in training: logit (softmax-weighted mean of the logits) or
+    probability (softmax-weighted mean of the occupancies, as in the papers)."""
+    blend_sharpness: float = 1.0
+    """Factor before the softmax of the blend (5 on occupancies in the released code)."""
+
+
+@dataclass
+class AvatarConfig:
+    """All that is needed to build an avatar's networks again."""
+
+    model: ModelConfig
+    skinning: SkinningConfig
+    search: SearchConfig
+    shape: ShapeConfig
+
+
+@dataclass
+class FieldSamples:
+    """Values of the posed field at B x N query points."""
+
+    logits: Tensor
+    """[B, N], occupied where positive; `NO_CORRESPONDENCE` where there is none."""
+    found: Tensor
+    """Which points have a correspondence, bool [B, N]."""
+    correspondences: int
+    """Number of correspondences of all points."""
+    search_s: float
+    """Seconds spent on the correspondence search."""
+    shape_s: float
+    """Seconds spent on the shape network."""
+
+
+class FastSnarf(nn.Module):
+    """Posed occupancy by correspondence search and a canonical occupancy network.
+
+    Args:
+        config: architecture.
+        bones: canonical ends of the bones, [S, 2, 3], metres.
+        num_bones: J.
+        grid: canonical box of the skinning weights.
+    """
+
+    def __init__(self, config: AvatarConfig, bones: Tensor, num_bones: int, grid: CanonicalGrid) -> None:
+        super().__init__()
+        if config.model.blend not in ("logit", "probability"):
+            raise ValueError(f"model.blend must be logit or probability, got {config.model.blend!r}")
+        self.config = config
+        self.deformer = ForwardDeformer(grid, bones, num_bones, config.skinning, config.search)
+        self.shape = OccupancyNetwork(config.shape, 3 * (num_bones - 1), bones)
+
+    def condition(self, pose: Tensor) -> Tensor:
+        """Return the pose condition [B, 3 (J - 1)]: joint angles without the global orientation, in half turns."""
+        return pose[:, 1:].flatten(1) / torch.pi
+
+    def forward(
+        self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+    ) -> FieldSamples:
+        """Evaluate the posed field: blended over the correspondences in training, their maximum otherwise.
+
+        Args:
+            points: [B, N, 3], posed space, metres.
+            bone_transforms: [B, J, 4, 4], canonical to posed.
+            pose: [B, J, 3] axis-angle, radians.
+            precision: of the matrix products in the shape network; the search always runs in full float32.
+
+        Source: SNARF Eq. 9.
+        """
+        start = time.perf_counter()
+        found = self.deformer(points, bone_transforms)
+        after_search = time.perf_counter()
+        logits = self.canonical_logits(found.canonical, self.condition(pose), found.pose, precision)
+        if self.training:
+            combined = blend(logits, found, self.config.model)
+        else:
+            combined = found.maximum(logits, NO_CORRESPONDENCE)
+        done = time.perf_counter()
+        return FieldSamples(combined, found.found, len(found.query), after_search - start, done - after_search)
+
+    def canonical_logits(self, canonical: Tensor, condition: Tensor, pose: Tensor, precision: str = "highest") -> Tensor:
+        """Return the canonical occupancy logits [M] of points [M, 3] under `condition[pose]` ([B, C] and [M])."""
+        with matmul_precision(precision):
+            if torch.is_grad_enabled():
+                return self.shape(canonical, condition, pose)
+            chunks = zip(canonical.split(_POINTS_AT_ONCE), pose.split(_POINTS_AT_ONCE), strict=True)
+            return torch.cat([self.shape(points, condition, index) for points, index in chunks])
+
+
+def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:
+    """Blend logits [M] over each query's correspondences to [B, N], smoothly, so that all of them get a gradient.
+
+    The weights are a softmax over the real roots only, so that the result does not depend on how the roots were found.
+    A query without a root gets `NO_CORRESPONDENCE`.
+
+    Source: SNARF Sec. 3.2 (after Eq. 9); the form on logits is ours, and keeps its gradient where occupancies saturate.
+    """
+    values = logits if config.blend == "logit" else logits.sigmoid()
+    scores = config.blend_sharpness * values
+    total = found.batch * found.count
+    highest = found.maximum(scores.detach(), 0.0).reshape(-1)
+    weights = (scores - highest[found.query]).exp()
+    zeros = logits.new_zeros(total)
+    norm = zeros.index_add(0, found.query, weights)
+    mean = zeros.index_add(0, found.query, weights * values) / norm.clamp_min(1e-12)
+    mask = found.found.reshape(-1)
+    if config.blend == "probability":
+        mean = torch.logit(mean, eps=1e-6)
+    return torch.where(mask, mean, NO_CORRESPONDENCE).reshape(found.batch, found.count)

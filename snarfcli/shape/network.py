@@ -1,0 +1,133 @@
+"""The canonical occupancy network f(x, p) of SNARF Eq. 1, as logits: occupied where positive."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from snarfcli.segments import distance_to_segments
+
+__all__ = ["OccupancyNetwork", "ShapeConfig"]
+
+_SOFTPLUS_SHARPNESS = 100.0  # as in the papers' code
+_LOGITS_PER_METRE = 30.0  # slope of the capsule prior across the surface
+
+
+@dataclass
+class ShapeConfig:
+    name: str = "mlp"
+    """Which canonical shape: mlp."""
+    width: int = 256
+    """Width of the hidden layers."""
+    depth: int = 8
+    """Number of hidden layers."""
+    activation: str = "softplus"
+    """softplus (with a sharpness of 100) or relu."""
+    skip_layers: list[int] = field(default_factory=lambda: [4])
+    """Layers whose input is joined with the point once more."""
+    frequencies: list[float] = field(default_factory=list)
+    """Angular frequencies of a sine and cosine encoding of the point, per metre; none for the bare point."""
+    condition_layer: int | None = 6
+    """Layer that the pose condition enters; null for a shape without pose condition."""
+    condition_size: int = 8
+    """Size of the code that the pose is reduced to before it enters."""
+    condition_at_start: bool = True
+    """Whether the pose has an influence from the start; false starts from a shape that is the same in every pose."""
+    geometric_init: bool = True
+    """Whether the network starts as a sphere of one metre (Atzmon and Lipman 2020)."""
+    weight_norm: bool = True
+    """Whether the layers are weight-normalised."""
+    prior_radius_m: float | None = None
+    """Radius of capsules around the bones that the network only corrects, metres; null for no such prior."""
+
+
+class OccupancyNetwork(nn.Module):
+    """Pose-conditioned occupancy of canonical points.
+
+    Args:
+        config: architecture.
+        pose_size: length of the pose condition; 0 for none.
+        bones: canonical ends of the bones, [S, 2, 3], metres, for the capsule prior.
+
+    The pose condition is joined to the input of one layer. Since it is the same for all points of a pose, its part of that
+    layer is evaluated once per pose and added to the points as a bias.
+    """
+
+    def __init__(self, config: ShapeConfig, pose_size: int, bones: Tensor) -> None:
+        super().__init__()
+        self.config = config
+        if config.activation not in ("softplus", "relu"):
+            raise ValueError(f"shape.activation must be softplus or relu, got {config.activation!r}")
+        self.conditioned = config.condition_layer is not None and pose_size > 0
+        if self.conditioned and not 0 <= config.condition_layer < config.depth:
+            raise ValueError(f"shape.condition_layer must lie in 0..{config.depth - 1}, got {config.condition_layer}")
+        self.register_buffer("bones", bones.clone())
+        self.register_buffer("frequencies", torch.tensor(config.frequencies), persistent=False)
+        point_size = 3 + 6 * len(config.frequencies)
+        self.pose_code = nn.Linear(pose_size, config.condition_size) if self.conditioned else None
+        layers = []
+        for index in range(config.depth + 1):
+            inputs = point_size if index == 0 else config.width
+            inputs += point_size if index in config.skip_layers else 0
+            joined = config.condition_size if self.conditioned and index == config.condition_layer else 0
+            layer = nn.Linear(inputs + joined, config.width if index < config.depth else 1)
+            self._initialise(layer, index, joined)
+            layers.append(nn.utils.parametrizations.weight_norm(layer) if config.weight_norm else layer)
+        self.layers = nn.ModuleList(layers)
+
+    def _initialise(self, layer: nn.Linear, index: int, joined: int) -> None:
+        """Set a layer's first weights; `joined` of its last inputs are the pose code."""
+        last = index == self.config.depth
+        with torch.no_grad():
+            if self.config.geometric_init:
+                if last:
+                    # The sign is turned round, since occupancy is positive inside where a distance is negative.
+                    layer.weight.normal_(-math.sqrt(math.pi) / math.sqrt(layer.in_features), 1e-4)
+                    layer.bias.fill_(1.0)
+                else:
+                    layer.weight.normal_(0, math.sqrt(2) / math.sqrt(layer.out_features))
+                    layer.bias.zero_()
+            elif last:
+                layer.weight.normal_(0, 1e-2)
+                layer.bias.zero_()
+            if joined and not self.config.condition_at_start:
+                layer.weight[:, -joined:] = 0
+
+    def forward(self, canonical: Tensor, condition: Tensor, pose: Tensor) -> Tensor:
+        """Return occupancy logits [M] at canonical points [M, 3], metres.
+
+        Args:
+            canonical: points [M, 3], metres.
+            condition: pose condition of each pose, [B, C].
+            pose: index of each point's pose, [M], 0 to B - 1.
+        """
+        encoded = self._encode(canonical)
+        h = encoded
+        for index, layer in enumerate(self.layers):
+            if index in self.config.skip_layers and index > 0:
+                h = torch.cat([h, encoded], 1) / math.sqrt(2)
+            if self.conditioned and index == self.config.condition_layer:
+                weight = layer.weight
+                points = h.shape[1]
+                per_pose = self.pose_code(condition) @ weight[:, points:].T + layer.bias
+                h = F.linear(h, weight[:, :points]) + per_pose.index_select(0, pose)
+            else:
+                h = layer(h)
+            if index < len(self.layers) - 1:
+                h = F.relu(h) if self.config.activation == "relu" else F.softplus(h, beta=_SOFTPLUS_SHARPNESS)
+        logits = h[:, 0]
+        if self.config.prior_radius_m is not None:
+            distance = distance_to_segments(canonical, self.bones)
+            logits = logits + _LOGITS_PER_METRE * (self.config.prior_radius_m - distance)
+        return logits
+
+    def _encode(self, canonical: Tensor) -> Tensor:
+        """Return points with their sine and cosine encoding, [M, 3 + 6 F]."""
+        if not len(self.frequencies):
+            return canonical
+        angles = (canonical[:, None] * self.frequencies[:, None]).flatten(1)
+        return torch.cat([canonical, angles.sin(), angles.cos()], 1)

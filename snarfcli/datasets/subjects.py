@@ -1,0 +1,107 @@
+"""The built-in subject set: ten people with DFaust's ids, each with a shape and a way of moving of their own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snarfcli.bodies import Body, Skeleton, builtin_body
+from snarfcli.errors import UserError, nearest
+from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, Motion, builtin_motion
+
+__all__ = ["BUILTIN_SUBJECTS", "HELD_OUT_SEQUENCES", "SequenceSpec", "SubjectData", "builtin_subject"]
+
+Split = Literal["train", "test", "ood"]
+
+HELD_OUT_SEQUENCES = {
+    "50002": "chicken_wings",
+    "50004": "hips",
+    "50007": "jiggle_on_toes",
+    "50009": "jumping_jacks",
+    "50020": "knees",
+    "50021": "light_hopping_stiff",
+    "50022": "light_hopping_loose",
+    "50025": "one_leg_jump",
+    "50026": "one_leg_loose",
+    "50027": "punching",
+}
+"""The sequence of each subject that is kept for testing, as in the split of SNARF and Fast-SNARF."""
+
+BUILTIN_SUBJECTS = tuple(HELD_OUT_SEQUENCES)
+"""Ids of the built-in subjects, which are DFaust's."""
+
+_SEQUENCES_PER_SUBJECT = 10
+
+
+@dataclass(frozen=True)
+class SequenceSpec:
+    """One motion of a subject and what it is for."""
+
+    name: str
+    """Name of the sequence."""
+    split: Split
+    """`train` (its last part is for validation), `test` (held out), or `ood` (out of distribution)."""
+    motion: Motion
+    """Poses, y up, at the rate of the recording."""
+
+
+@dataclass(frozen=True)
+class SubjectData:
+    """A person: a body, a shape and motions."""
+
+    data: str
+    """Which data this is; `builtin` here."""
+    subject: str
+    """The subject's id."""
+    body: Body
+    """The body model."""
+    betas: NDArray[np.float64]
+    """[S] shape parameters."""
+    skeleton: Skeleton
+    """Joints of this shape and the canonical pose."""
+    sequences: tuple[SequenceSpec, ...]
+    """Training, test and out-of-distribution sequences, in this order."""
+
+    def of_split(self, split: Split) -> tuple[SequenceSpec, ...]:
+        """Return the sequences of one split."""
+        return tuple(sequence for sequence in self.sequences if sequence.split == split)
+
+
+def _betas(subject: str, count: int) -> NDArray[np.float64]:
+    # Standard normal is what the shape space is scaled to; 0.9 and the clip keep everyone an ordinary adult.
+    return np.clip(0.9 * np.random.default_rng([int(subject), 1]).standard_normal(count), -2.0, 2.0)
+
+
+def _sequence_names(subject: str) -> tuple[str, ...]:
+    """Return the subject's ten sequences in TRAINING_SEQUENCES' order, the held-out one among them."""
+    held_out = HELD_OUT_SEQUENCES[subject]
+    others = [name for name in TRAINING_SEQUENCES if name != held_out]
+    chosen = np.random.default_rng([int(subject), 2]).permutation(others)[: _SEQUENCES_PER_SUBJECT - 1]
+    return tuple(name for name in TRAINING_SEQUENCES if name == held_out or name in chosen)
+
+
+def builtin_subject(subject: str | int) -> SubjectData:
+    """Make one of the built-in subjects: always the same one for the same id.
+
+    Args:
+        subject: one of `BUILTIN_SUBJECTS`.
+
+    Raises:
+        UserError: there is no such subject; the message names the nearest valid id.
+    """
+    subject = str(subject)
+    if subject not in HELD_OUT_SEQUENCES:
+        raise UserError(
+            f"no built-in subject '{subject}'{nearest(subject, BUILTIN_SUBJECTS)} Known are {', '.join(BUILTIN_SUBJECTS)}"
+        )
+    body = builtin_body()
+    betas = _betas(subject, body.num_betas)
+    held_out = HELD_OUT_SEQUENCES[subject]
+    names = _sequence_names(subject)
+    splits: list[tuple[str, Split]] = [(name, "train") for name in names if name != held_out]
+    splits += [(held_out, "test"), *((name, "ood") for name in OUT_OF_DISTRIBUTION_SEQUENCES)]
+    sequences = tuple(SequenceSpec(name, split, builtin_motion(name, int(subject))) for name, split in splits)
+    return SubjectData("builtin", subject, body, betas, body.skeleton(betas), sequences)

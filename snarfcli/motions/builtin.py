@@ -1,0 +1,55 @@
+"""The built-in motions: procedural stand-ins for DFaust's exercises and PosePrior's extremes."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+from snarfcli.errors import UserError, nearest
+from snarfcli.motions.anatomy import poses_from_angles
+from snarfcli.motions.curves import Style
+from snarfcli.motions.everyday import EXERCISES
+from snarfcli.motions.extremes import EXTREMES, perform
+from snarfcli.motions.footing import plant_foot, stand_on_floor
+from snarfcli.motions.motion import Motion
+
+__all__ = ["OUT_OF_DISTRIBUTION_SEQUENCES", "TRAINING_SEQUENCES", "builtin_motion"]
+
+TRAINING_SEQUENCES: tuple[str, ...] = tuple(EXERCISES)
+"""Exercises, by DFaust's names."""
+OUT_OF_DISTRIBUTION_SEQUENCES: tuple[str, ...] = tuple(EXTREMES)
+"""Extremes inside the limits of the joints, in the place of PosePrior's seven sequences."""
+
+
+def builtin_motion(name: str, seed: int = 0, *, duration_s: float = 4.0, frame_rate: float = 60.0) -> Motion:
+    """Make a motion of SMPL's 24 joints: y up, facing +z, on the spot, feet on the floor.
+
+    Args:
+        name: one of `TRAINING_SEQUENCES` or `OUT_OF_DISTRIBUTION_SEQUENCES`.
+        seed: whose motion it is: sizes, tempo, phase and noise follow from it. The same seed gives the same motion; the
+            frame rate only chooses where it is looked at.
+        duration_s: length in seconds.
+        frame_rate: frames a second.
+
+    Raises:
+        UserError: there is no motion of this name.
+        ValueError: duration or frame rate is not positive, or no frame fits.
+    """
+    if name not in EXERCISES and name not in EXTREMES:
+        known = (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES)
+        raise UserError(f"no built-in motion '{name}'{nearest(name, known)} Known are {', '.join(known)}")
+    frames = round(duration_s * frame_rate) if duration_s > 0 and frame_rate > 0 else 0
+    if frames < 1:
+        raise ValueError(f"duration_s, frame_rate: wanted at least one frame, got {duration_s} s at {frame_rate} a second")
+    t = np.arange(frames) / frame_rate
+    style = Style(np.random.default_rng([seed, zlib.crc32(name.encode())]))
+    scene = EXERCISES[name](style, t) if name in EXERCISES else perform(EXTREMES[name], style, t, duration_s)
+    poses = poses_from_angles(scene.angles, frames)
+    if scene.feet:
+        translation = scene.pelvis
+        for side, path in scene.feet.items():
+            poses = plant_foot(poses, translation, side, path)
+    else:
+        translation = stand_on_floor(poses) + scene.pelvis
+    return Motion(name, poses, translation, float(frame_rate))

@@ -1,0 +1,78 @@
+"""Curves in time: noise, pulses, hops and smooth ways between key values. All depend on time alone, not on the frame rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+__all__ = ["Style", "hop", "pulse", "smooth_noise", "through"]
+
+Array = NDArray[np.float64]
+
+_GRAVITY = 9.81
+
+
+def smooth_noise(rng: np.random.Generator, t: Array, slowest_hz: float = 0.15, fastest_hz: float = 1.2) -> Array:
+    """Return noise [T] of unit standard deviation: seven sines of random phase, weaker the faster they are."""
+    frequencies = np.geomspace(slowest_hz, fastest_hz, 7) * rng.uniform(0.85, 1.15, 7)
+    weights = frequencies**-0.5
+    weights *= np.sqrt(2 / np.sum(weights**2))
+    phases = rng.uniform(0, 2 * np.pi, 7)
+    return np.sum(weights[:, None] * np.sin(2 * np.pi * frequencies[:, None] * t + phases[:, None]), 0)
+
+
+def pulse(phase: Array, centre: float, width: float) -> Array:
+    """Return a smooth bump [T] of height 1, once a cycle of `phase` (in cycles), `width` cycles wide at its foot."""
+    distance = np.abs((phase - centre + 0.5) % 1.0 - 0.5) / (width / 2)
+    return np.where(distance < 1, 0.5 + 0.5 * np.cos(np.pi * np.minimum(distance, 1)), 0.0)
+
+
+def hop(phase: Array, period_s: float, height_m: float) -> tuple[Array, Array]:
+    """Return the vertical way of a hopping body, once a cycle of `phase` (in cycles).
+
+    Returns:
+        lift [T] metres: a ballistic arc in flight, and the dip on the ground that joins it without a kink; and the share of
+        flight [T], 0 on the ground, 1 at the top.
+    """
+    flight_s = np.sqrt(8 * height_m / _GRAVITY)
+    share = min(flight_s / period_s, 0.8)
+    height_m = _GRAVITY * (share * period_s) ** 2 / 8
+    u = phase % 1.0
+    ground = 1 - share
+    in_flight = u >= ground
+    w = np.where(in_flight, (u - ground) / share, 0.0)
+    arc = 4 * w * (1 - w)
+    dip = 4 * height_m * ground / (np.pi * share)
+    return np.where(in_flight, height_m * arc, -dip * np.sin(np.pi * np.minimum(u / ground, 1))), arc
+
+
+def through(t: Array, times: Sequence[float], values: Sequence[float]) -> Array:
+    """Return a smooth curve [T] through key values that never overshoots them and rests where two are equal."""
+    return PchipInterpolator(np.asarray(times, float), np.asarray(values, float))(np.clip(t, times[0], times[-1]))
+
+
+class Style:
+    """How one person moves: a seeded source of sizes, tempos and phases. The order of the draws is the seed's meaning."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+
+    def around(self, value: float, spread: float = 0.15) -> float:
+        """Return `value` times one plus or minus up to `spread`."""
+        return value * (1 + spread * self.rng.uniform(-1, 1))
+
+    def between(self, low: float, high: float) -> float:
+        """Return a number between two."""
+        return float(self.rng.uniform(low, high))
+
+    def noise(self, t: Array, size: float, slowest_hz: float = 0.15, fastest_hz: float = 1.2) -> Array:
+        """Return smooth noise [T] of standard deviation `size`."""
+        return size * smooth_noise(self.rng, t, slowest_hz, fastest_hz)
+
+    def phase(self, t: Array, tempo_hz: float) -> Array:
+        """Return the phase [T] in cycles of a beat that starts anywhere and keeps time as people do, within about 3 %."""
+        start = self.rng.uniform()
+        return start + tempo_hz * t + 0.025 * smooth_noise(self.rng, t, 0.15, 0.6)

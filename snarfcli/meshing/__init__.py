@@ -1,0 +1,19 @@
+"""Surface extraction: coarse-to-fine evaluation, marching cubes, posed surfaces of avatars."""
+
+from snarfcli.meshing.extract import EmptySurface, FullSurface, extract_surface
+from snarfcli.meshing.mesh import ExtractionStats, Mesh, vertex_normals
+from snarfcli.meshing.surfaces import SURFACES, canonical_surface, field_surface, posed_mesh, skinned_surface
+
+__all__ = [
+    "SURFACES",
+    "EmptySurface",
+    "ExtractionStats",
+    "FullSurface",
+    "Mesh",
+    "canonical_surface",
+    "extract_surface",
+    "field_surface",
+    "posed_mesh",
+    "skinned_surface",
+    "vertex_normals",
+]

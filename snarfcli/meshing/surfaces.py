@@ -1,0 +1,184 @@
+"""The two surfaces of a posed avatar: the field's own, and the canonical mesh moved by its skin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from snarfcli.meshing.extract import extract_surface
+from snarfcli.meshing.mesh import Mesh
+
+__all__ = ["SURFACES", "AvatarLike", "canonical_surface", "field_surface", "posed_mesh", "skinned_surface"]
+
+SURFACES = ("field", "skinned")
+
+# Logits beyond this say no more than occupied or not, but would pull vertices onto lattice nodes: a point without a
+# correspondence has a very negative one.
+_LARGEST_LOGIT = 10.0
+# Voxel of a skinned surface's canonical mesh and of the mesh that lends its weights, cells along the longest side.
+_WEIGHTS_RESOLUTION = 128
+_NEIGHBOURS = 8
+
+
+class AvatarLike(Protocol):
+    """What the surfaces need of an avatar, which moves what it is given to its device itself."""
+
+    def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor: ...
+
+    def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor): ...
+
+    def canonical_logits(self, points_c: Tensor, pose: Tensor) -> Tensor: ...
+
+    def skinning_weights(self, points_c: Tensor) -> Tensor: ...
+
+    def skin(self, points_c: Tensor, bone_transforms: Tensor) -> Tensor: ...
+
+    def canonical_box(self) -> tuple[Tensor, Tensor]: ...
+
+    def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]: ...
+
+
+@torch.no_grad()
+def field_surface(
+    avatar: AvatarLike,
+    pose: Tensor,
+    translation: Tensor | None = None,
+    resolution: int = 256,
+    *,
+    weights_from: Mesh | None = None,
+    keep_share: float = 0.01,
+    chunk: int = 65536,
+) -> Mesh:
+    """Extract the surface of the posed occupancy: the union over all correspondences, watertight (S Eq. 9).
+
+    Args:
+        avatar: gives the field.
+        pose: [J, 3] axis-angle, radians, global orientation included.
+        translation: [3] metres.
+        resolution: cells along the longest side of the posed box.
+        weights_from: canonical mesh with weights (`canonical_surface`); each vertex then takes the weights of the nearest
+            vertex of this mesh in the same pose that faces the same way.
+        keep_share: see `extract_surface`.
+        chunk: points in one query.
+
+    Raises:
+        EmptySurface, FullSurface: the field has no surface.
+    """
+    pose, transforms = _posed(avatar, pose, translation)
+    lower, upper = avatar.posed_box(transforms)
+
+    def posed_logits(points: Tensor) -> Tensor:
+        return avatar.query(points[None], transforms[None], pose[None]).logits[0].clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+
+    mesh = extract_surface(posed_logits, lower, upper, resolution, keep_share=keep_share, chunk=chunk).with_normals()
+    return (
+        mesh if weights_from is None else replace(mesh, weights=_borrow_weights(avatar, transforms, mesh, weights_from))
+    )
+
+
+@torch.no_grad()
+def canonical_surface(
+    avatar: AvatarLike,
+    pose: Tensor,
+    resolution: int = _WEIGHTS_RESOLUTION,
+    *,
+    keep_share: float = 0.01,
+    chunk: int = 65536,
+) -> Mesh:
+    """Extract the canonical surface under the condition of `pose` [J, 3], with exact skinning weights.
+
+    Raises:
+        EmptySurface, FullSurface: the field has no surface.
+    """
+    lower, upper = avatar.canonical_box()
+
+    def canonical_logits(points_c: Tensor) -> Tensor:
+        return avatar.canonical_logits(points_c, pose).clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+
+    mesh = extract_surface(canonical_logits, lower, upper, resolution, keep_share=keep_share, chunk=chunk)
+    weights = _in_chunks(avatar.skinning_weights, mesh.vertices)
+    return replace(mesh, weights=weights).with_normals()
+
+
+@torch.no_grad()
+def skinned_surface(
+    avatar: AvatarLike,
+    pose: Tensor,
+    translation: Tensor | None = None,
+    resolution: int = 256,
+    *,
+    keep_share: float = 0.01,
+    chunk: int = 65536,
+) -> Mesh:
+    """Extract the canonical surface under the condition of `pose` and move it by linear blend skinning.
+
+    The mesh keeps its canonical topology, so it may cross itself where the body touches itself, and carries its weights.
+
+    Args and raises: as `field_surface`; `resolution` counts along the longest side of the canonical box.
+    """
+    pose, transforms = _posed(avatar, pose, translation)
+    mesh_c = canonical_surface(avatar, pose, resolution, keep_share=keep_share, chunk=chunk)
+    return replace(mesh_c, vertices=_skin(avatar, transforms, mesh_c.vertices), normals=None).with_normals()
+
+
+def posed_mesh(
+    avatar: AvatarLike,
+    pose: Tensor,
+    translation: Tensor | None = None,
+    resolution: int = 256,
+    *,
+    surface: str = "field",
+    weights_from: Mesh | None = None,
+) -> Mesh:
+    """Return the surface of the kind `surface`, see `SURFACES`; `weights_from` serves `field` only.
+
+    Raises:
+        ValueError: `surface` is unknown.
+        EmptySurface, FullSurface: the field has no surface.
+    """
+    if surface == "field":
+        return field_surface(avatar, pose, translation, resolution, weights_from=weights_from)
+    if surface == "skinned":
+        return skinned_surface(avatar, pose, translation, resolution)
+    raise ValueError(f"surface: wanted one of {', '.join(SURFACES)}, got {surface!r}")
+
+
+def _posed(avatar: AvatarLike, pose: Tensor, translation: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Check the arguments; return the pose as float32 and the bone transforms [J, 4, 4]."""
+    if pose.ndim != 2 or pose.shape[1] != 3:
+        raise ValueError(f"pose: wanted shape [J, 3], got {list(pose.shape)}")
+    if translation is not None and translation.shape != (3,):
+        raise ValueError(f"translation: wanted shape [3], got {list(translation.shape)}")
+    pose = pose.float()
+    translation = None if translation is None else translation.float()[None]
+    return pose, avatar.bone_transforms(pose[None], translation)[0]
+
+
+def _skin(avatar: AvatarLike, transforms: Tensor, vertices_c: np.ndarray) -> np.ndarray:
+    return _in_chunks(lambda points_c: avatar.skin(points_c, transforms), vertices_c)
+
+
+def _in_chunks(function: Callable[[Tensor], Tensor], points: np.ndarray, chunk: int = 65536) -> np.ndarray:
+    """Call `function` on parts of `points` [N, 3] and return the joined results as float32."""
+    parts = [function(part).cpu() for part in torch.from_numpy(points).split(chunk)]
+    return torch.cat(parts).float().numpy()
+
+
+def _borrow_weights(avatar: AvatarLike, transforms: Tensor, mesh: Mesh, mesh_c: Mesh) -> np.ndarray:
+    """Return the weights [V, J] of the nearest vertex of `mesh_c`, posed, that faces the same way."""
+    from scipy.spatial import cKDTree
+
+    if mesh_c.weights is None:
+        raise ValueError("weights_from: wanted a mesh with weights, got one without")
+    lender = replace(mesh_c, vertices=_skin(avatar, transforms, mesh_c.vertices), normals=None).with_normals()
+    count = min(_NEIGHBOURS, len(lender.vertices))
+    # A hand on a hip is near the hip's vertices too, but those look the other way.
+    nearest = cKDTree(lender.vertices).query(mesh.vertices, k=count)[1].reshape(len(mesh.vertices), count)
+    facing = np.einsum("vk,vnk->vn", mesh.normals, lender.normals[nearest]) > 0
+    choice = np.where(facing.any(axis=1), facing.argmax(axis=1), 0)
+    return mesh_c.weights[nearest[np.arange(len(nearest)), choice]]

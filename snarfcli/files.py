@@ -73,7 +73,7 @@ def read_npz(path: str | Path, what: str = "file") -> dict[str, np.ndarray]:
             return {key: archive[key] for key in archive.files}
     except ValueError as error:
         if "allow_pickle" in str(error):
-            raise UserError(f"{what} {path} holds pickled Python objects, which are never executed; save plain arrays") from None
+            raise UserError(f"{what} {path} holds pickled objects, which are never executed; save plain arrays") from None
         raise UserError(f"{what} {path} cannot be read ({error}); copy or download it again") from None
     except (zipfile.BadZipFile, EOFError, OSError, KeyError, zlib.error) as error:
         raise UserError(f"{what} {path} is damaged ({error}); copy or download it again") from None

@@ -1,0 +1,306 @@
+"""The `snarf` command: flags become Hydra overrides, then Hydra composes the configuration and runs the command."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import snarfcli
+from snarfcli.errors import UserError, nearest
+from snarfcli.settings import check_overrides, config_folder, describe, group_options, group_schemas
+
+__all__ = ["COMMANDS", "Command", "main"]
+
+log = logging.getLogger(__name__)
+
+EXIT_USER_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Command:
+    """One subcommand."""
+
+    name: str
+    """Name of the configuration file, and of the command on the command line."""
+    module: str
+    """Module below `snarfcli.commands` with `run` and the configuration's dataclass."""
+    schema: str
+    """Name of that dataclass."""
+    summary: str
+    """What it does, in one line."""
+    example: str
+    """A call that works on a fresh machine once the commands before it have run."""
+    flags: dict[str, str]
+    """Flags and the overrides they stand for; `{}` takes the flag's value."""
+
+
+_COMMANDS = (
+    Command(
+        "preprocess",
+        "preprocess",
+        "PreprocessConfig",
+        "sample occupancies from posed meshes",
+        "snarf preprocess subject=50002",
+        {},
+    ),
+    Command(
+        "train",
+        "train",
+        "TrainConfig",
+        "train the avatar of one subject",
+        "snarf train subject=50002",
+        {"--resume": "resume=true"},
+    ),
+    Command(
+        "eval",
+        "evaluate",
+        "EvalConfig",
+        "IoU on the held-out motion, or on out-of-distribution poses (also: evaluate)",
+        "snarf eval --ood subject=50002",
+        {"--ood": "split=ood"},
+    ),
+    Command(
+        "animate",
+        "animate",
+        "AnimateConfig",
+        "posed meshes and a video of a motion",
+        "snarf animate --pose seq.npz subject=50002",
+        {"--pose": "pose={}"},
+    ),
+)
+COMMANDS = {command.name: command for command in _COMMANDS} | {"evaluate": _COMMANDS[2]}
+
+_HYDRA_FLAGS = ("-m", "--multirun", "--cfg", "-c", "--resolve", "--package", "-p", "--info", "-i", "--hydra-help")
+
+
+# Run folders are the commands' own business: Hydra writes nothing, changes no folder and leaves logging alone.
+_HYDRA_SETTINGS = (
+    "hydra.run.dir=.",
+    "hydra.output_subdir=null",
+    "hydra.sweep.dir=outputs/multirun",
+    "hydra.sweep.subdir=.",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code: 0, 1 (partly failed), 2 (a user can mend it) or 130 (Ctrl-C)."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_overview())
+        return 0
+    if arguments[0] in ("-V", "--version"):
+        print(f"snarf {snarfcli.__version__}")
+        return 0
+    if arguments[0] not in COMMANDS:
+        hint = nearest(arguments[0], COMMANDS)
+        print(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(COMMANDS)}", file=sys.stderr)
+        return EXIT_USER_ERROR
+    command = COMMANDS[arguments[0]]
+    _set_up_logging()
+    try:
+        return _run(command, arguments[1:])
+    except KeyboardInterrupt:
+        print(f"snarf {command.name}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        message = _user_message(error)
+        if message is None:
+            raise
+        print(f"snarf {command.name}: {message}", file=sys.stderr)
+        return EXIT_USER_ERROR
+
+
+def _run(command: Command, arguments: list[str]) -> int:
+    """Translate flags, compose the configuration and run the command, once or for every job of a multirun."""
+    if any(argument in ("-h", "--help") for argument in arguments):
+        print(_help(command))
+        return 0
+    overrides = _translate_flags(command, arguments)
+    module = importlib.import_module(f"snarfcli.commands.{command.module}")
+    schema = getattr(module, command.schema)
+    check_overrides([argument for argument in overrides if not argument.startswith("-") and "=" in argument], schema)
+    _register(command.name, schema)
+    codes: list[int] = []
+    errors: list[Exception] = []
+
+    import hydra
+    from omegaconf import OmegaConf
+
+    def job(config: Any) -> None:
+        missing = sorted(OmegaConf.missing_keys(config))
+        try:
+            if missing:
+                raise UserError(f"no value for {', '.join(missing)}; give it as {missing[0]}=...")
+            codes.append(module.run(OmegaConf.to_object(config)) or 0)
+        except Exception as error:  # Hydra would print it in its own way
+            errors.append(error)
+
+    entry: Callable[[], None] = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=command.name)(job)
+    # Hydra would print errors of the configuration in its own way and end the process; so it hands them to `main`.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    before = sys.argv
+    sys.argv = [f"snarf {command.name}", *_HYDRA_SETTINGS, *overrides]
+    try:
+        entry()
+    finally:
+        sys.argv = before
+    if errors:
+        raise errors[0]
+    return max(codes, default=0)
+
+
+def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
+    """Replace the command's flags by overrides; refuse unknown flags and words that are no override."""
+    out: list[str] = []
+    rest = list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        name, equals, value = argument.partition("=")
+        if name in command.flags:
+            override = command.flags[name]
+            if "{}" in override:
+                if not equals:
+                    if not rest:
+                        raise UserError(f"{name} needs a value, such as {name} FILE")
+                    value = rest.pop(0)
+                override = override.format(_quote(value))
+            elif equals:
+                raise UserError(f"{name} takes no value, got {argument!r}")
+            out.append(override)
+        elif name in _HYDRA_FLAGS:
+            out.append(argument)
+            if name in ("--cfg", "-c", "--package", "-p", "--info", "-i") and not equals and rest and "=" not in rest[0]:
+                out.append(rest.pop(0))
+        elif argument.startswith("-"):
+            valid = [*command.flags, "--help", *_HYDRA_FLAGS]
+            raise UserError(f"unknown flag {argument!r}{nearest(argument, valid)}; see \"snarf {command.name} --help\"")
+        elif not equals and not argument.startswith("~"):
+            raise UserError(f"{argument!r} is no setting; write name=value; see \"snarf {command.name} --help\"")
+        else:
+            out.append(argument)
+    return out
+
+
+def _quote(value: str) -> str:
+    """Return a value that Hydra's grammar reads back unchanged, whatever characters a file name has."""
+    return "'" + re.sub(r"(\\*)'", lambda m: m.group(1) * 2 + "\\'", value) + "'"
+
+
+def _register(name: str, schema: type) -> None:
+    """Put the dataclass of a command, and those of its fields, into Hydra's store as `schema/...`."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance()
+    store.store(group="schema", name=name, node=schema)
+    for group, node in group_schemas(schema).items():
+        store.store(group="schema", name=group, node=node)
+
+
+# ---------------------------------------------------------------- messages
+def _user_message(error: BaseException) -> str | None:
+    """Return one line for an error that a user can mend, or None for a fault of the program."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    chain = _chain(error)
+    for link in chain:
+        if isinstance(link, UserError):
+            return _one_line(link)
+    for link in chain:
+        if isinstance(link, OSError) and not isinstance(link, (ConnectionError, ChildProcessError)):
+            return _file_message(link)
+    if isinstance(error, OmegaConfBaseException | HydraException):
+        return _config_message(chain)
+    return None
+
+
+def _chain(error: BaseException) -> list[BaseException]:
+    """Return the error and its causes."""
+    links: list[BaseException] = []
+    current: BaseException | None = error
+    while current is not None and current not in links:
+        links.append(current)
+        current = current.__cause__ or current.__context__
+    return links
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _file_message(error: OSError) -> str:
+    """Return what went wrong with a file and what to do."""
+    name = error.filename2 or error.filename or "a file"
+    advice = {
+        errno.ENOSPC: "the disk is full; make room, then run the command again: it goes on where it stopped",
+        errno.EDQUOT: "the disk quota is used up; make room, then run the command again",
+        errno.EACCES: "no permission; choose another folder with output_root=... or data_root=...",
+        errno.EPERM: "no permission; choose another folder with output_root=... or data_root=...",
+        errno.EROFS: "the file system is read-only; choose another folder with output_root=... or data_root=...",
+        errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
+        errno.EISDIR: "is a folder, not a file",
+        errno.ENOENT: "is not there",
+    }
+    return f"{name}: {advice.get(error.errno or 0, error.strerror or str(error))}"
+
+
+def _config_message(chain: list[BaseException]) -> str:
+    """Return one line for a setting whose value does not fit."""
+    text = " ".join(_one_line(link) for link in chain)
+    unfit = re.search(r"Value '([^']*)'.*? could not be converted to (\w+)", text)
+    key = re.search(r"full_key: ([\w.]+)", text)
+    if unfit and key:
+        return f"{key.group(1)} wants {_TYPE_NAMES.get(unfit.group(2), unfit.group(2))}, got '{unfit.group(1)}'"
+    lines = dict.fromkeys(" ".join(str(link).strip().splitlines()[0].split()) for link in chain if str(link).strip())
+    return ": ".join(list(lines)[:2])
+
+
+_TYPE_NAMES = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "a text"}
+
+
+def _set_up_logging() -> None:
+    """Print the program's own messages plainly on standard output."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout)
+    logging.getLogger("snarfcli").setLevel(logging.INFO)
+
+
+def _overview() -> str:
+    """Return the help of `snarf` itself."""
+    rows = "\n".join(f"  {command.name:<12}{command.summary}" for command in _COMMANDS)
+    return (
+        "snarf learns an animatable avatar of one subject from posed meshes.\n\n"
+        f"usage: snarf COMMAND [FLAGS] [SETTING=VALUE ...]\n\n{rows}\n\n"
+        "Work through them in this order. \"snarf COMMAND --help\" tells more, \"snarf --version\" the version."
+    )
+
+
+def _help(command: Command) -> str:
+    """Return the help of one command: purpose, example, flags, groups and settings."""
+    module = importlib.import_module(f"snarfcli.commands.{command.module}")
+    schema = getattr(module, command.schema)
+    lines = [f"snarf {command.name}: {command.summary}", "", f"example: {command.example}", ""]
+    flags = command.flags | {"--cfg job": "print the configuration and stop", "-m": "a run for each of comma-separated values"}
+    lines += ["flags:"] + [f"  {flag:<22}{meaning}" for flag, meaning in flags.items()] + [""]
+    groups = [group for group in group_schemas(schema) if group_options(group)]
+    if groups:
+        lines += ["choices (GROUP=OPTION):"]
+        for group in groups:
+            lines.append(f"  {group:<22}{', '.join(group_options(group))}")
+        lines.append("")
+    lines += ["settings (NAME=VALUE):"]
+    for name, text in describe(schema):
+        lines.append(f"  {name:<22}{text}")
+    for group, node in group_schemas(schema).items():
+        lines += ["", f"settings of {group} ({group}.NAME=VALUE):"]
+        lines += [f"  {name:<22}{text}" for name, text in describe(node)]
+    return "\n".join(lines)

@@ -1,0 +1,191 @@
+"""`snarf train`: learn the avatar of one subject from processed samples."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import MISSING, OmegaConf
+
+from snarfcli.bodies import Skeleton
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.store import SampleStore
+from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
+from snarfcli.errors import UserError
+from snarfcli.files import atomic_path, write_json
+from snarfcli.models.avatar import Avatar, load_checkpoint
+from snarfcli.models.extent import unpose_by_nearest_bone
+from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
+from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
+from snarfcli.shape import ShapeConfig
+from snarfcli.training.loop import train
+from snarfcli.training.settings import TrainingConfig
+from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Trainer
+
+__all__ = ["TrainConfig", "run"]
+
+log = logging.getLogger(__name__)
+_FRAMES_FOR_EXTENT = 8
+
+
+@dataclass
+class TrainConfig:
+    """Settings of `snarf train`."""
+
+    subject: str = MISSING
+    """Whose avatar, such as 50002."""
+    data: DataConfig = MISSING
+    """Where the samples come from."""
+    model: ModelConfig = MISSING
+    """Which system."""
+    skinning: SkinningConfig = MISSING
+    """The field of skinning weights."""
+    search: SearchConfig = MISSING
+    """The correspondence search."""
+    shape: ShapeConfig = MISSING
+    """The canonical occupancy network."""
+    training: TrainingConfig = MISSING
+    """Steps, batches, losses."""
+    data_root: str = MISSING
+    """Folder with the processed samples."""
+    output_root: str = MISSING
+    """Folder for results; the run goes to <output_root>/<data>/<subject>/<run>."""
+    run: str = MISSING
+    """Name of the run."""
+    resume: bool = MISSING
+    """Continue an interrupted run in the same folder; a finished run is left as it is."""
+    overwrite: bool = MISSING
+    """Replace a run in the same folder."""
+    device: str = MISSING
+    """auto, cpu, cuda or cuda:N."""
+    threads: int | None = MISSING
+    """Threads for tensor work; null leaves PyTorch's choice."""
+    seed: int = MISSING
+    """Seed of everything random."""
+
+
+def run(config: TrainConfig) -> None:
+    """Train one subject and write the run folder: avatar, checkpoint, metrics, configuration, TensorBoard events."""
+    folder = run_folder(config.output_root, config.data.name, config.subject, config.run)
+    checkpoint = folder / "checkpoint.pt"
+    started = checkpoint.exists() or (folder / "avatar.pt").exists()
+    if started and not (config.resume or config.overwrite):
+        raise UserError(
+            f"{folder} already holds a run; give resume=true to continue it, overwrite=true to replace it, "
+            "or run=NAME for another folder"
+        )
+    device = choose_device(config.device)
+    set_threads(config.threads)
+    seed_everything(config.seed)
+    store = SampleStore.open(config.data_root, config.data.name, config.subject)
+    log.info("data: %s, subject %s, %s", config.data.name, config.subject, store.summary())
+
+    avatar_config = AvatarConfig(config.model, config.skinning, config.search, config.shape)
+    facts = {"data": config.data.name, "subject": config.subject, "seed": config.seed, "training": config.training.name}
+    grid = canonical_grid(store, config.skinning)
+    avatar = Avatar(avatar_config, store.skeleton, grid, facts)
+    trainer = Trainer(avatar, store, config.training, config.seed, device)
+    if config.resume and checkpoint.exists():
+        state = load_checkpoint(checkpoint, CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
+        trainer.restore(state, str(checkpoint))
+        if trainer.step >= config.training.steps and (folder / "avatar.pt").exists():
+            log.info("already trained: %s, nothing left to do", folder / "avatar.pt")
+            return
+        log.info("resuming at step %d of %d", trainer.step, config.training.steps)
+    elif config.overwrite and folder.exists():
+        shutil.rmtree(folder)
+    _write_config(folder, config)
+    parameters = sum(p.numel() for p in avatar.model.parameters())
+    log.info("run: %s, %s parameters, %d steps on %s", folder, f"{parameters:,}", config.training.steps, device)
+
+    start = time.time()
+    with _scalars(folder, trainer.step) as on_scalars:
+        try:
+            result = train(trainer, folder, on_scalars=on_scalars)
+        except KeyboardInterrupt:
+            log.info("stopped at step %d; continue with resume=true", trainer.step)
+            raise
+    averaged = trainer.averaged_avatar()
+    averaged.facts |= {"steps": trainer.step, "validation": result["validation"]}
+    averaged.save(folder / "avatar.pt")
+    write_json(folder / "metrics.json", _metrics(config, result, trainer, time.time() - start))
+    validation = result["validation"]
+    if validation:
+        log.info(
+            "validation (held-back motion): IoU bbox %.2f %%, surface %.2f %%",
+            100 * validation["iou_bbox"],
+            100 * validation["iou_surface"],
+        )
+    log.info("avatar: %s", folder / "avatar.pt")
+
+
+def canonical_grid(store: SampleStore, skinning: SkinningConfig) -> CanonicalGrid:
+    """Return the canonical box of the weights: the body as far as it can be told without a template, plus margins.
+
+    The frames nearest to the canonical pose are taken back bone by bone (`unpose_by_nearest_bone`).
+    """
+    skeleton: Skeleton = store.skeleton
+    frames = [(s, int(f)) for s in store.sequences("train") for f in s.train_frames]
+    if not frames:
+        raise UserError('the samples hold no training frames; run "snarf preprocess" with the training sequences')
+    poses = np.stack([s.poses[f] for s, f in frames])
+    canonical = skeleton.canonical_pose.numpy()
+    distance = np.abs(poses[:, 1:] - canonical[None, 1:]).sum((1, 2))
+    points = [skeleton.canonical_joints.float()]
+    for index in np.argsort(distance, kind="stable")[:_FRAMES_FOR_EXTENT]:
+        sequence, frame = frames[index]
+        vertices = torch.as_tensor(np.asarray(sequence.vertices(frame)), dtype=torch.float32)
+        transforms = torch.as_tensor(np.asarray(sequence.bone_transforms[frame]), dtype=torch.float32)
+        points.append(unpose_by_nearest_bone(vertices, transforms, skeleton.to(torch.float32)))
+    return CanonicalGrid.around(torch.cat(points), skinning.margin_m)
+
+
+def _write_config(folder: Path, config: TrainConfig) -> None:
+    """Write the resolved configuration."""
+    with atomic_path(folder / "config.yaml") as temporary:
+        OmegaConf.save(OmegaConf.structured(config), temporary)
+
+
+def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seconds: float) -> dict[str, Any]:
+    """Return what `metrics.json` says about the training run."""
+    validation = result["validation"]
+    return {
+        "data": config.data.name,
+        "subject": config.subject,
+        "model": config.model.name,
+        "split": "validation",
+        "iou_bbox": validation.get("iou_bbox"),
+        "iou_surface": validation.get("iou_surface"),
+        "frames": config.training.validation_frames,
+        "steps": trainer.step,
+        "seed": config.seed,
+        "timings": {"wall_s": round(seconds, 2)} | {k: v for k, v in result.items() if k != "validation"},
+        "training": asdict(config.training),
+        **machine_facts(),
+    }
+
+
+class _scalars:
+    """A TensorBoard writer for a run folder, as a context that yields a function (step, named numbers)."""
+
+    def __init__(self, folder: Path, step: int) -> None:
+        self.folder, self.step = folder, step
+
+    def __enter__(self):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.step or None)
+        return self.write
+
+    def write(self, step: int, numbers: dict[str, float]) -> None:
+        for name, value in numbers.items():
+            self.writer.add_scalar(name, value, step)
+
+    def __exit__(self, *exception: object) -> None:
+        self.writer.close()

@@ -1,0 +1,103 @@
+"""Run folders: where results go, and the facts that every run records."""
+
+from __future__ import annotations
+
+import os
+import platform
+import random
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import snarfcli
+from snarfcli.errors import UserError, nearest
+
+__all__ = ["choose_device", "find_avatar", "machine_facts", "run_folder", "seed_everything", "set_threads"]
+
+
+def run_folder(output_root: str, data: str, subject: str, run: str) -> Path:
+    """Return the folder of one run: `<output_root>/<data>/<subject>/<run>`."""
+    return Path(output_root) / data / str(subject) / run
+
+
+def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str | None) -> Path:
+    """Return the file of a trained avatar.
+
+    Raises:
+        UserError: there is none; the message names the command that makes one.
+    """
+    if ckpt is not None:
+        path = Path(ckpt)
+        path = path / "avatar.pt" if path.is_dir() else path
+        if not path.is_file():
+            raise UserError(f"no avatar at {ckpt} (ckpt); give the avatar.pt that \"snarf train\" wrote")
+        return path
+    folder = run_folder(output_root, data, subject, run)
+    if not (folder / "avatar.pt").is_file():
+        trained = sorted(p.parent.name for p in folder.parent.glob("*/avatar.pt"))
+        hint = f"; trained runs there: {', '.join(trained)}{nearest(run, trained)}" if trained else ""
+        raise UserError(f'no avatar in {folder}{hint}; run "snarf train subject={subject}" or give ckpt=PATH')
+    return folder / "avatar.pt"
+
+
+def choose_device(name: str) -> torch.device:
+    """Return the device named "auto" (a GPU where there is one), "cpu", "cuda" or "cuda:N".
+
+    Raises:
+        UserError: the name is unknown or the device is not there.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise UserError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}") from None
+    if device.type not in ("cpu", "cuda"):
+        raise UserError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        seen = torch.cuda.device_count()
+        raise UserError(f"device {name} is not there: PyTorch {torch.__version__} sees {seen} GPUs; use device=cpu")
+    return device
+
+
+def set_threads(threads: int | None) -> None:
+    """Use so many threads for tensor work; None leaves PyTorch's choice, which follows OMP_NUM_THREADS."""
+    if threads is not None:
+        if threads < 1:
+            raise UserError(f"threads must be at least 1, got {threads}")
+        torch.set_num_threads(threads)
+
+
+def seed_everything(seed: int) -> None:
+    """Seed the generators of Python, NumPy and PyTorch."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
+
+
+def machine_facts() -> dict[str, Any]:
+    """Return the versions and the machine that a result was made with."""
+    versions = {"snarf": snarfcli.__version__, "python": platform.python_version(), "torch": torch.__version__}
+    for package in ("numpy", "scikit-image", "trimesh", "libigl", "pymeshlab"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    machine = {"system": platform.system(), "processor": _processor(), "cores": os.cpu_count()}
+    machine["threads"] = torch.get_num_threads()
+    if torch.cuda.is_available():
+        machine["gpu"] = torch.cuda.get_device_name()
+    return {"versions": versions, "machine": machine}
+
+
+def _processor() -> str:
+    """Return the processor's name."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text(errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()

@@ -1,0 +1,96 @@
+"""The settings of a command: its dataclasses, their descriptions, and a check of overrides against them."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import textwrap
+import typing
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from snarfcli.errors import UserError, nearest
+
+__all__ = ["check_overrides", "config_folder", "describe", "group_options", "group_schemas", "setting_names"]
+
+
+def config_folder() -> Path:
+    """Return the folder with the yaml files: inside the package when installed, at the top of a checkout."""
+    inside = Path(__file__).parent / "conf"
+    return inside if inside.is_dir() else Path(__file__).parents[1] / "conf"
+
+
+def group_options(group: str) -> list[str]:
+    """Return the options of a configuration group, such as complete and broyden for `search`."""
+    return sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
+
+
+def group_schemas(schema: type) -> dict[str, type]:
+    """Return the fields of a dataclass that are dataclasses themselves, by name."""
+    hints = typing.get_type_hints(schema)
+    nested = {field.name: hints[field.name] for field in dataclasses.fields(schema)}
+    return {name: hint for name, hint in nested.items() if dataclasses.is_dataclass(hint)}
+
+
+def describe(schema: type) -> Iterator[tuple[str, str]]:
+    """Yield the name of each plain field of a dataclass and the docstring below it."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(schema))).body[0].body  # type: ignore[attr-defined]
+    texts: dict[str, str] = {}
+    for field, below in zip(body, body[1:], strict=False):
+        is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) and isinstance(below.value.value, str)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
+            texts[field.target.id] = " ".join(below.value.value.split())
+    nested = group_schemas(schema)
+    for field in dataclasses.fields(schema):
+        if field.name not in nested:
+            yield field.name, texts.get(field.name, "")
+
+
+def setting_names(schema: type, prefix: str = "") -> list[str]:
+    """Return the dotted names of all settings of a dataclass."""
+    nested = group_schemas(schema)
+    names: list[str] = []
+    for field in dataclasses.fields(schema):
+        name = prefix + field.name
+        names += [name, *setting_names(nested[field.name], name + ".")] if field.name in nested else [name]
+    return names
+
+
+def check_overrides(overrides: Sequence[str], schema: type) -> None:
+    """Refuse overrides that name no setting, or no option of a choice, with the nearest valid name.
+
+    Raises:
+        UserError: for the first override that does not fit.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser = OverridesParser.create()
+    names = setting_names(schema)
+    groups = group_schemas(schema)
+    for text in overrides:
+        try:
+            override = parser.parse_override(text)
+        except HydraException as error:
+            reason = " ".join(str(error).split())
+            raise UserError(f"cannot read {text!r} ({reason}); quote special characters: NAME='\"VALUE\"'") from None
+        key = override.key_or_group
+        if key.split(".")[0] == "hydra" or key.startswith("hydra/"):
+            continue
+        if key not in names:
+            raise UserError(f"unknown setting '{key}'{nearest(key, names)}; \"--help\" lists all settings")
+        if key in groups:
+            options = group_options(key)
+            for option in _values(override):
+                if str(option) not in options:
+                    near = nearest(str(option), options)
+                    raise UserError(f"there is no {key}={option}{near}; choose from {', '.join(options)}")
+
+
+def _values(override: Any) -> list[Any]:
+    """Return the value of an override, or all values of a sweep."""
+    if override.is_sweep_override():
+        return [value.strip("'\"") for value in override.sweep_string_iterator()]
+    return [override.value()]

@@ -1,0 +1,75 @@
+"""Batches of posed points for training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from snarfcli.datasets.store import SampleStore
+from snarfcli.errors import UserError
+from snarfcli.training.settings import TrainingConfig
+
+__all__ = ["Batch", "FrameBatches", "load_frames"]
+
+
+@dataclass
+class Batch:
+    """Sampled points of B frames."""
+
+    points: Tensor
+    """[B, N, 3], posed space, metres."""
+    occupied: Tensor
+    """bool [B, N]."""
+    bone_transforms: Tensor
+    """[B, J, 4, 4], canonical to posed."""
+    pose: Tensor
+    """[B, J, 3] axis-angle, radians."""
+
+
+class FrameBatches:
+    """Draw random frames and points; step k gives the same batch in every run with the same seed.
+
+    Args:
+        store: processed samples of one subject.
+        config: how many frames and points.
+        seed: of the whole run.
+        device: where the batches go.
+    """
+
+    def __init__(self, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> None:
+        self.sequences = store.sequences("train")
+        self.frames = [(index, int(frame)) for index, s in enumerate(self.sequences) for frame in s.train_frames]
+        if not self.frames:
+            raise UserError('the samples hold no training frames; run "snarf preprocess" with the training sequences')
+        self.config, self.seed, self.device = config, seed, device
+
+    def batch(self, step: int) -> Batch:
+        """Return the batch of one step."""
+        random = np.random.default_rng([self.seed, step])
+        count = self.config.poses_per_step
+        chosen = random.choice(len(self.frames), count, replace=count > len(self.frames))
+        picks = []
+        for index in chosen:
+            sequence = self.sequences[self.frames[index][0]]
+            half = sequence.num_points // 2
+            uniform = random.integers(0, half, self.config.uniform_points)
+            surface = random.integers(half, sequence.num_points, self.config.surface_points)
+            picks.append((sequence, self.frames[index][1], np.concatenate([uniform, surface])))
+        return load_frames(picks, self.device)
+
+
+def load_frames(picks: list, device: torch.device) -> Batch:
+    """Gather frames, given as tuples (sequence, frame, point indices), into one batch."""
+    points = np.stack([sequence.points(frame, index) for sequence, frame, index in picks])
+    occupied = np.stack([sequence.occupancies(frame, index) for sequence, frame, index in picks])
+    transforms = np.stack([sequence.bone_transforms[frame] for sequence, frame, _ in picks])
+    pose = np.stack([sequence.poses[frame] for sequence, frame, _ in picks])
+    return Batch(
+        torch.as_tensor(points, dtype=torch.float32, device=device),
+        torch.as_tensor(occupied, dtype=torch.bool, device=device),
+        torch.as_tensor(transforms, dtype=torch.float32, device=device),
+        torch.as_tensor(pose, dtype=torch.float32, device=device),
+    )

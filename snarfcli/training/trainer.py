@@ -1,0 +1,190 @@
+"""One optimiser step after the other: the state of a training run and what a step does to it."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from snarfcli.datasets.store import SampleStore
+from snarfcli.errors import UserError
+from snarfcli.models.avatar import Avatar
+from snarfcli.models.extent import bone_segments
+from snarfcli.precision import PRECISIONS, matmul_precision
+from snarfcli.training.batches import FrameBatches, load_frames
+from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
+from snarfcli.training.settings import TrainingConfig
+
+__all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Trainer"]
+
+CHECKPOINT_FORMAT = "snarf-checkpoint"
+CHECKPOINT_VERSION = 1
+
+
+class Trainer:
+    """Train an avatar's networks on the samples of one subject.
+
+    All randomness comes from the seed and the number of the step, and from PyTorch's generator, whose state a checkpoint
+    holds: a resumed run takes the same steps as an uninterrupted one.
+
+    Args:
+        avatar: the avatar to train, on `device`.
+        store: processed samples.
+        config: settings.
+        seed: of the run.
+        device: where to compute.
+    """
+
+    def __init__(
+        self, avatar: Avatar, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device
+    ) -> None:
+        if config.precision not in PRECISIONS:
+            raise ValueError(f"training.precision must be one of {', '.join(PRECISIONS)}, got {config.precision!r}")
+        self.avatar, self.store, self.config, self.seed, self.device = avatar, store, config, seed, device
+        self.model = avatar.model.to(device)
+        self.model.train()
+        self.batches = FrameBatches(store, config, seed, device)
+        self.bones = bone_segments(avatar.skeleton).to(device)
+        self.joints = avatar.skeleton.canonical_joints.to(device)
+        self.joint_targets = joint_weight_targets(avatar.skeleton.parents, config.joint_target).to(device)
+        self.parameters = [p for p in self.model.parameters() if p.requires_grad]
+        self.average = [p.detach().clone() for p in self.parameters]
+        self.optimizer = torch.optim.Adam(self.parameters, lr=config.learning_rate)
+        self.step = 0
+
+    def advance(self) -> dict[str, float]:
+        """Take one step and return its losses and counts."""
+        batch = self.batches.batch(self.step)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.autocast, cache_enabled=False):
+            field = self.model(batch.points, batch.bone_transforms, batch.pose, self.config.precision)
+        losses = {"occupancy": occupancy_loss(field.logits.float(), batch.occupied, field.found)}
+        if self.step < self.config.bootstrap_steps:
+            losses |= self._bootstrap_losses(batch.pose)
+        total = sum(losses.values())
+        self.optimizer.zero_grad(set_to_none=True)
+        with matmul_precision(self.config.precision):
+            total.backward()
+        self.optimizer.step()
+        self.step += 1
+        self._update_average()
+        lost = (batch.occupied & ~field.found).sum() / batch.occupied.sum().clamp_min(1)
+        numbers = {name: loss.item() for name, loss in losses.items()}
+        numbers |= {"total": float(total), "inside_without_correspondence": float(lost)}
+        numbers |= {"correspondences_per_point": field.correspondences / max(batch.occupied.numel(), 1)}
+        return numbers
+
+    def learning_rate(self) -> float:
+        """Return the learning rate of the coming step: linear warm-up, then a cosine down to the final rate."""
+        config = self.config
+        warm = min(1.0, (self.step + 1) / max(config.warmup_steps, 1))
+        cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / max(config.steps, 1))))
+        return config.learning_rate * warm * (config.final_learning_rate + (1 - config.final_learning_rate) * cosine)
+
+    def _bootstrap_losses(self, pose: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the losses that fill the bones and tie the joints to their bones (SNARF Sec. 3.3)."""
+        generator = torch.Generator().manual_seed(int(np.random.default_rng([self.seed, self.step, 1]).integers(2**62)))
+        points = points_on_bones(self.bones, self.config.bone_points, generator)
+        index = torch.arange(len(points), device=self.device) % len(pose)
+        logits = self.model.canonical_logits(points, self.model.condition(pose), index, self.config.precision)
+        weights = self.model.deformer.field(self.joints)
+        return {
+            "bone_occupancy": self.config.bone_occupancy_weight
+            * F.binary_cross_entropy_with_logits(logits.float(), torch.ones_like(logits)),
+            "joint_weight": self.config.joint_weight * F.mse_loss(weights, self.joint_targets),
+        }
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        """Move the averaged weights towards the current ones; quickly at first, since the first weights are worth little."""
+        decay = min(self.config.average_decay, (1 + self.step) / (10 + self.step))
+        torch._foreach_lerp_(self.average, [p.detach() for p in self.parameters], 1 - decay)
+
+    def averaged_avatar(self) -> Avatar:
+        """Return a copy of the avatar with the averaged weights, ready to use."""
+        avatar = copy.copy(self.avatar)
+        avatar.model = copy.deepcopy(self.model)
+        with torch.no_grad():
+            for parameter, average in zip(avatar.model.parameters(), self.average, strict=True):
+                parameter.copy_(average)
+        return avatar.to(self.device)
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float]:
+        """Return the IoU of the averaged avatar on held-back frames of the training sequences, uniform and near-surface."""
+        avatar = self.averaged_avatar()
+        frames = [(sequence, int(f)) for sequence in self.store.sequences("train") for f in sequence.val_frames]
+        count = min(self.config.validation_frames, len(frames))
+        values = []
+        for index in np.linspace(0, len(frames) - 1, count).round().astype(int):
+            sequence, frame = frames[index]
+            batch = load_frames([(sequence, frame, np.arange(0, sequence.num_points, 2))], self.device)
+            inside = avatar.query(batch.points, batch.bone_transforms, batch.pose).logits > 0
+            half = inside.shape[1] // 2
+            values.append([_iou(inside[:, part], batch.occupied[:, part]) for part in (slice(half), slice(half, None))])
+        if not values:
+            return {}
+        bbox, surface = np.mean(values, 0)
+        return {"iou_bbox": float(bbox), "iou_surface": float(surface)}
+
+    # ---------------------------------------------------------------- checkpoints
+    def state(self) -> dict[str, Any]:
+        """Return everything that the coming steps depend on, as plain dicts and tensors."""
+        return {
+            "format": CHECKPOINT_FORMAT,
+            "version": CHECKPOINT_VERSION,
+            "step": self.step,
+            "seed": self.seed,
+            "avatar": self.avatar.to_dict(),
+            "training": asdict(self.config),
+            "average": [value.cpu().clone() for value in self.average],
+            "optimizer": self.optimizer.state_dict(),
+            "random": torch.get_rng_state(),
+        }
+
+    def restore(self, state: dict[str, Any], path: str) -> None:
+        """Continue from `state`; `path` names the checkpoint in messages.
+
+        Raises:
+            UserError: the state belongs to other settings, or does not fit.
+        """
+        ours = self.avatar.to_dict()["config"] | {"training": asdict(self.config), "seed": self.seed}
+        theirs = state["avatar"]["config"] | {"training": state["training"], "seed": state["seed"]}
+        changed = _differences(theirs, ours)
+        if changed:
+            raise UserError(
+                f"{path} was made with other settings ({', '.join(changed[:4])}); give the same settings to resume, "
+                "overwrite=true to start again, or run=NAME for another folder"
+            )
+        try:
+            self.model.load_state_dict(state["avatar"]["state"])
+            self.optimizer.load_state_dict(state["optimizer"])
+            for mine, saved in zip(self.average, state["average"], strict=True):
+                mine.copy_(saved)
+            torch.set_rng_state(state["random"])
+            self.step = int(state["step"])
+        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise UserError(f"{path} does not fit this version ({reason}); start again with overwrite=true") from None
+        self.model.train()
+
+
+def _iou(predicted: torch.Tensor, wanted: torch.Tensor) -> float:
+    """Return intersection over union of two boolean masks; 1 where both are empty."""
+    union = (predicted | wanted).sum()
+    return float((predicted & wanted).sum() / union) if union else 1.0
+
+
+def _differences(theirs: Any, ours: Any, prefix: str = "") -> list[str]:
+    """Return the dotted names under which two nested dicts differ, with both values."""
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        names = sorted(set(theirs) | set(ours))
+        parts = [_differences(theirs.get(n), ours.get(n), f"{prefix}.{n}" if prefix else n) for n in names]
+        return [line for part in parts for line in part]
+    return [] if theirs == ours else [f"{prefix}: {theirs} there, {ours} here"]

@@ -1,0 +1,97 @@
+"""`snarf preprocess`: sample occupancies from the posed meshes of a subject."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from omegaconf import MISSING
+
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.errors import UserError, nearest
+
+__all__ = ["PreprocessConfig", "run"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class PreprocessConfig:
+    """Settings of `snarf preprocess`."""
+
+    subject: str = MISSING
+    """The subject's id, such as 50002; `all` for every subject of the data set."""
+    data: DataConfig = MISSING
+    """The data set."""
+    data_root: str = MISSING
+    """The data folder; samples go under `processed/{data}/{subject}` in it."""
+    points_per_frame: int = MISSING
+    """Points a frame, a multiple of 8: half uniform in the papers' box, half near the surface."""
+    surface_noise_m: float = MISSING
+    """Standard deviation of the near-surface points' distance along each axis, metres."""
+    padding: float = MISSING
+    """How much longer the sampling cube is than the longest side of the mesh's box, as a share."""
+    inside_test: str = MISSING
+    """`winding`: overlapping parts are inside. `parity`: they are outside, as in the papers' released code."""
+    workers: int = MISSING
+    """Processes; 0: one a core."""
+    seed: int = MISSING
+    """Start of the random numbers; the samples do not depend on the number of workers."""
+    overwrite: bool = MISSING
+    """Discard the samples that are there and start again."""
+    sequences: list[str] = MISSING
+    """Names of the sequences to make; all if empty."""
+
+
+def run(config: PreprocessConfig) -> None:
+    """Make the samples of one subject or of all; what is there already is kept.
+
+    Raises:
+        UserError: a value cannot be used, a subject or sequence is unknown, or the samples there do not go with the settings.
+        OSError: the data folder cannot be written to, or the disk is full.
+    """
+    from snarfcli.datasets.preprocessing import preprocess_subject
+    from snarfcli.sampling import SamplingSettings, count_cores
+
+    known, load = _subjects(config.data.name)
+    sampling = SamplingSettings(
+        points_per_frame=config.points_per_frame,
+        surface_noise_m=config.surface_noise_m,
+        padding=config.padding,
+        inside_test=config.inside_test,
+        seed=config.seed,
+    )
+    steps = {
+        "train": config.data.frame_step,
+        "test": config.data.test_frame_step,
+        "ood": config.data.ood_frame_step,
+    }
+    for split, step in steps.items():
+        if step < 1:
+            raise UserError(f"data: the frame step of {split} sequences must be at least 1, got {step}")
+    if config.workers < 0:
+        raise UserError(f"workers: wanted a number of processes, or 0 for one a core, got {config.workers}")
+    workers = config.workers or count_cores()
+    for subject in known if config.subject == "all" else [config.subject]:
+        data = load(subject)
+        log.info("subject %s of %s data, %d processes", subject, data.data, workers)
+        preprocess_subject(
+            data,
+            config.data_root,
+            sampling,
+            steps,
+            workers=workers,
+            overwrite=config.overwrite,
+            sequences=config.sequences,
+        )
+
+
+def _subjects(data: str) -> tuple[Sequence[str], Callable]:
+    """Return the subjects of a data set and the function that loads one."""
+    from snarfcli.datasets.subjects import BUILTIN_SUBJECTS, builtin_subject
+
+    sources = {"builtin": (BUILTIN_SUBJECTS, builtin_subject)}
+    if data not in sources:
+        raise UserError(f"no data set '{data}'{nearest(data, sources)}; there is {', '.join(sources)}")
+    return sources[data]

@@ -1,0 +1,185 @@
+"""What an evaluation says: the table on the terminal and the content of `metrics.json`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from snarfcli.evaluation.metrics import FrameMetrics, Summary, group_by_sequence, mean_of_sequences, summarise
+
+__all__ = ["PROTOCOL", "REFERENCE_POINTS", "SPLITS", "Evaluation", "metrics_content", "plain", "table", "timings_text"]
+
+SPLITS = {"id": "in distribution", "ood": "out of distribution"}
+"""What can be evaluated: held-out motion of the training's kind, and poses unlike it."""
+
+REFERENCE_POINTS = 200_000
+"""Number of points for which the papers' table states times (Fast-SNARF table 1)."""
+
+PROTOCOL = {
+    "iou_bbox": "uniform points in the cube around the posed mesh, longest side x 1.1",
+    "iou_surface": "points near the surface",
+    "iou_tight_box": "the uniform points that lie in the tight box of the posed mesh",
+    "averaging": "mean over all frames of the IoU of each frame; a sequence's value is the mean over its frames",
+    "empty_sets": "the IoU of two empty sets is 1",
+    "without_correspondence": "shares of the points of all frames together",
+    "timings": "one untimed call first; times for 200,000 points are scaled from calls of points_per_frame points",
+}
+"""How the numbers are made, as `metrics.json` states it."""
+
+_NAME_WIDTH = 30  # longer names of sequences are cut, so that the table fits 100 columns
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The measured frames of one avatar on one split, and where they came from."""
+
+    data: str
+    """Data set."""
+    subject: str
+    """Subject."""
+    model: str
+    """System."""
+    split: str
+    """One of `SPLITS`."""
+    frames: Sequence[FrameMetrics]
+    """Measured frames, sequence by sequence."""
+    wall_s: float
+    """Seconds for the whole of it, reading included."""
+    machine: Mapping[str, Any]
+    """`versions` and `machine`, see `snarfcli.runs.machine_facts`."""
+    device: str = "cpu"
+    """Where the avatar computed."""
+    training: Mapping[str, Any] = field(default_factory=dict)
+    """Facts about the avatar's making."""
+    search: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of the correspondence search."""
+
+
+def table(evaluation: Evaluation) -> str:
+    """Return the table of an evaluation: a row for each sequence, then the means, IoU and shares in percent."""
+    groups = {name: summarise(frames) for name, frames in group_by_sequence(evaluation.frames).items()}
+    overall = summarise(evaluation.frames)
+    width = min(_NAME_WIDTH, max(len(name) for name in [*groups, "mean of sequences"]))
+    head = f"{'':{width}}  {'':6}  {'IoU %':^31}    no correspondence %"
+    names = f"{'sequence':{width}}  frames  {'bbox':>6}  {'surface':>7}  {'tight':>6}  {'worst':>6}"
+    names += f"    {'all':>8}  {'inside':>9}"
+    rule = "-" * len(names)
+    title = (
+        f"{evaluation.model} of subject {evaluation.subject}, data {evaluation.data}, "
+        f"{SPLITS[evaluation.split]} ({evaluation.split})"
+    )
+    lines = [title, "", head.rstrip(), names, rule]
+    lines += [_row(name, summary, width) for name, summary in groups.items()]
+    lines.append(rule)
+    if len(groups) > 1:
+        means = mean_of_sequences(evaluation.frames)
+        lines.append(
+            f"{'mean of sequences':{width}}  {'':6}  {100 * means['iou_bbox']:6.2f}  {100 * means['iou_surface']:7.2f}  "
+            f"{100 * means['iou_tight_box']:6.2f}"
+        )
+    lines.append(_row("all frames", overall, width))
+    lines.append("bbox: the papers' cube; tight: the mesh's own box; worst: lowest surface IoU of a frame")
+    return "\n".join(lines)
+
+
+def _row(name: str, summary: Summary, width: int) -> str:
+    name = name if len(name) <= width else name[: width - 3] + "..."
+    return (
+        f"{name:{width}}  {summary.frames:6d}  {100 * summary.iou_bbox:6.2f}  {100 * summary.iou_surface:7.2f}  "
+        f"{100 * summary.iou_tight_box:6.2f}  {100 * summary.worst_iou_surface:6.2f}    {100 * summary.without:8.2f}  "
+        f"{100 * summary.inside_without:9.3f}"
+    )
+
+
+def timings_text(evaluation: Evaluation) -> str:
+    """Return two lines: the times for as many points as in the papers' table, and where and how long it ran."""
+    times = _timings(evaluation)
+    machine = evaluation.machine["machine"]
+    where = machine["gpu"] if times["device"] != "cpu" and "gpu" in machine else f"{machine['threads']} threads"
+    return (
+        f"time for {REFERENCE_POINTS:,} points: search {times['search_ms_per_200k']:.1f} ms, "
+        f"shape {times['shape_ms_per_200k']:.1f} ms, total {times['total_ms_per_200k']:.1f} ms\n"
+        f"{len(evaluation.frames)} frames in {evaluation.wall_s:.1f} s on {times['device']}, {where}"
+    )
+
+
+def _timings(evaluation: Evaluation) -> dict[str, Any]:
+    summary = summarise(evaluation.frames)
+    scale = 1000 * REFERENCE_POINTS / max(summary.points, 1)
+    seconds = {"search": summary.search_s, "shape": summary.shape_s, "total": summary.total_s}
+    return {
+        **{f"{name}_s": round(value, 4) for name, value in seconds.items()},
+        **{f"{name}_ms_per_200k": round(value * scale, 3) for name, value in seconds.items()},
+        "wall_s": round(evaluation.wall_s, 3),
+        "points": summary.points,
+        "device": evaluation.device,
+        "threads": evaluation.machine["machine"]["threads"],
+    }
+
+
+def metrics_content(evaluation: Evaluation, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what `metrics.json` holds, as plain JSON values; IoU and shares from 0 to 1, times in seconds unless named.
+
+    Args:
+        evaluation: what was measured.
+        settings: the resolved settings of the command; `seed` is among them.
+    """
+    overall = summarise(evaluation.frames)
+    groups = group_by_sequence(evaluation.frames)
+    content = {
+        "data": evaluation.data,
+        "subject": evaluation.subject,
+        "model": evaluation.model,
+        "split": evaluation.split,
+        **_values(overall),
+        "points_per_frame": evaluation.frames[0].points,
+        "mean_of_sequences": mean_of_sequences(evaluation.frames),
+        "sequences": {name: _sequence(frames) for name, frames in groups.items()},
+        "timings": _timings(evaluation),
+        "protocol": PROTOCOL,
+        **evaluation.machine,
+        "training": dict(evaluation.training),
+        "search": dict(evaluation.search),
+        "seed": settings.get("seed"),
+        "settings": dict(settings),
+    }
+    return plain(content)
+
+
+def _values(summary: Summary) -> dict[str, Any]:
+    return {
+        "iou_bbox": summary.iou_bbox,
+        "iou_surface": summary.iou_surface,
+        "iou_tight_box": summary.iou_tight_box,
+        "worst_iou_surface": summary.worst_iou_surface,
+        "frames": summary.frames,
+        "without_correspondence": summary.without,
+        "inside_without_correspondence": summary.inside_without,
+    }
+
+
+def _sequence(frames: Sequence[FrameMetrics]) -> dict[str, Any]:
+    summary = asdict(summarise(frames))
+    times = {name: round(summary[name], 4) for name in ("search_s", "shape_s", "total_s")}
+    names = ("frame", "iou_bbox", "iou_surface", "iou_tight_box", "without", "inside", "inside_without")
+    per_frame = {name: [getattr(frame, name) for frame in frames] for name in names}
+    per_frame = {name: [round(value, 6) for value in values] for name, values in per_frame.items()}
+    return {**_values(summarise(frames)), **times, "per_frame": per_frame}
+
+
+def plain(value: Any) -> Any:
+    """Return `value` as JSON can hold it: no tensors, arrays, paths or infinities; what is not finite becomes null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple, set)):
+        return [plain(entry) for entry in value]
+    if hasattr(value, "tolist"):  # arrays and tensors, scalars too
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, (bool, int, str)) or value is None:
+        return value
+    return str(value) if isinstance(value, Path) else repr(value)

@@ -84,7 +84,9 @@ def run(config: TrainConfig) -> None:
     set_threads(config.threads)
     seed_everything(config.seed)
     store = SampleStore.open(config.data_root, config.data.name, config.subject)
-    log.info("data: %s, subject %s, %s", config.data.name, config.subject, store.summary())
+    sequences = store.sequences("train")
+    frames = sum(len(sequence.train_frames) for sequence in sequences)
+    log.info("data: %s, subject %s, %d sequences, %d frames to train on", store.data, store.subject, len(sequences), frames)
 
     avatar_config = AvatarConfig(config.model, config.skinning, config.search, config.shape)
     facts = {"data": config.data.name, "subject": config.subject, "seed": config.seed, "training": config.training.name}

@@ -34,11 +34,11 @@ class DistilledWeights(nn.Module):
         self.layers = nn.ModuleList(layers)
         self.sharpness = sharpness
         self.register_buffer("centre", (grid.lower + grid.upper) / 2, persistent=False)
-        self.register_buffer("half", (grid.upper - grid.lower) / 2, persistent=False)
+        self.register_buffer("half_extent", (grid.upper - grid.lower) / 2, persistent=False)
 
     def forward(self, canonical: Tensor) -> Tensor:
         """Return the skinning weights [N, J] at canonical points [N, 3], rows sum to 1."""
-        h = (canonical - self.centre) / self.half
+        h = (canonical - self.centre) / self.half_extent
         for layer in self.layers[:-1]:
             h = nn.functional.softplus(layer(h), beta=100)
         return torch.softmax(self.sharpness * self.layers[-1](h), dim=-1)

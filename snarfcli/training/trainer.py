@@ -76,7 +76,7 @@ class Trainer:
         self._update_average()
         lost = (batch.occupied & ~field.found).sum() / batch.occupied.sum().clamp_min(1)
         numbers = {name: loss.item() for name, loss in losses.items()}
-        numbers |= {"total": float(total), "inside_without_correspondence": float(lost)}
+        numbers |= {"total": total.item(), "inside_without_correspondence": lost.item()}
         numbers |= {"correspondences_per_point": field.correspondences / max(batch.occupied.numel(), 1)}
         return numbers
 

@@ -1,0 +1,71 @@
+"""Work on several processes: order, errors, and that nothing is left running."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from snarfcli.errors import UserError
+from snarfcli.sampling import run_in_processes
+
+
+def _count(start: int, stop: int) -> Iterator[tuple[int, int]]:
+    for value in range(start, stop):
+        yield value, os.getpid()
+
+
+def _fail(kind: str) -> Iterator[int]:
+    yield 1
+    if kind == "die":
+        os._exit(7)
+    if kind == "strange":
+        error = ValueError("cannot be sent")
+        error.reason = lambda: None  # type: ignore[attr-defined]
+        raise error
+    raise UserError("no such thing")
+
+
+def _forever() -> Iterator[int]:
+    while True:
+        yield 0
+
+
+def test_every_task_has_a_process_of_its_own_and_keeps_its_order() -> None:
+    items: dict[int, list] = {}
+    for task, item in run_in_processes(_count, [(0, 3), (10, 10), (5, 7)], 2):
+        items.setdefault(task, []).append(item)
+    assert {task: [value for value, _ in found] for task, found in items.items()} == {0: [0, 1, 2], 2: [5, 6]}
+    assert len({process for found in items.values() for _, process in found} | {os.getpid()}) == 3
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "message"),
+    [
+        ("raise", UserError, "no such thing"),
+        ("die", UserError, r"worker process ended early \(exit code 7\).*fewer workers"),
+        ("strange", RuntimeError, "ValueError: cannot be sent"),
+    ],
+)
+def test_a_failure_reaches_the_caller(kind: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        list(run_in_processes(_fail, [(kind,)], 1))
+    assert not multiprocessing.active_children()
+
+
+def test_leaving_early_ends_the_workers_and_draws_no_more_tasks() -> None:
+    drawn = []
+
+    def tasks() -> Iterator[tuple]:
+        for number in range(100):
+            drawn.append(number)
+            yield ()
+
+    results = run_in_processes(_forever, tasks(), 1)
+    assert next(results) == (0, 0)
+    results.close()
+    assert not multiprocessing.active_children()
+    assert drawn == [0]

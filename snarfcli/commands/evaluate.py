@@ -1,0 +1,178 @@
+"""`snarf eval`: IoU of a trained avatar on held-out motion or on out-of-distribution poses."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from omegaconf import MISSING
+
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.store import SampleStore, samples_folder
+from snarfcli.datasets.subjects import builtin_subject
+from snarfcli.deformer import SearchConfig
+from snarfcli.errors import UserError, nearest
+from snarfcli.evaluation.evaluate import evaluate
+from snarfcli.evaluation.report import SPLITS, Evaluation, metrics_content, table, timings_text
+from snarfcli.files import write_json
+from snarfcli.models.avatar import Avatar
+from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
+
+__all__ = ["EvalConfig", "run"]
+
+log = logging.getLogger(__name__)
+
+_STORE_SPLITS = {"id": "test", "ood": "ood"}
+_SEARCHES = ("complete", "broyden")
+
+
+@dataclass
+class EvalConfig:
+    """Settings of `snarf eval`."""
+
+    subject: str = MISSING
+    """Whose avatar, such as 50002."""
+    data: DataConfig = MISSING
+    """Where the samples come from."""
+    search: SearchConfig | None = None
+    """The correspondence search; null for the one that the avatar was trained with."""
+    data_root: str = MISSING
+    """Folder with the processed samples."""
+    output_root: str = MISSING
+    """Folder with the runs; the avatar is <output_root>/<data>/<subject>/<run>/avatar.pt."""
+    run: str = MISSING
+    """Name of the run."""
+    split: str = MISSING
+    """id (held-out motion) or ood (out-of-distribution poses)."""
+    ckpt: str | None = MISSING
+    """Avatar file or run folder to evaluate instead; results go beside it."""
+    max_frames: int | None = MISSING
+    """Evaluate so many frames, evenly spaced; null for all."""
+    points: int | None = MISSING
+    """Evaluate so many points a frame, half uniform, half near the surface; null for all."""
+    figure: bool = MISSING
+    """Whether to draw the worst and the best frames."""
+    figure_frames: int = MISSING
+    """How many of the worst and how many of the best frames are drawn."""
+    figure_resolution: int = MISSING
+    """Voxels along the longest side of the meshes in the figure."""
+    device: str = MISSING
+    """auto, cpu, cuda or cuda:N."""
+    threads: int | None = MISSING
+    """Threads for tensor work; null leaves PyTorch's choice."""
+    seed: int = MISSING
+    """Seed of the choice of points."""
+
+
+def run(config: EvalConfig) -> None:
+    """Evaluate one avatar: print the table, write `metrics.json` and the figure to `eval_<split>` in the run folder.
+
+    Raises:
+        UserError: there is no avatar, there are no samples, they do not go together, or a setting cannot be used.
+    """
+    _check(config)
+    path = find_avatar(config.output_root, config.data.name, config.subject, config.run, config.ckpt)
+    device = choose_device(config.device)
+    set_threads(config.threads)
+    seed_everything(config.seed)
+    store = SampleStore.open(config.data_root, config.data.name, config.subject)
+    sequences = store.sequences(_STORE_SPLITS[config.split])
+    avatar = Avatar.load(path, device)
+    _check_match(avatar, store, config)
+    if config.search is not None:
+        avatar.model.deformer.search = config.search
+    search = avatar.model.deformer.search
+    folder = path.parent / _folder_name(config)
+    _check_writable(folder)
+    log.info(
+        "data: %s, subject %s, %s: %d sequences, %d frames",
+        store.data, store.subject, SPLITS[config.split], len(sequences), sum(s.num_frames for s in sequences),
+    )  # fmt: skip
+    log.info("avatar: %s, search %s, on %s", path, search.name, device)
+
+    start = time.perf_counter()
+    frames = evaluate(
+        avatar,
+        sequences,
+        max_frames=config.max_frames,
+        points=config.points,
+        seed=config.seed,
+        desc=f"eval {config.subject} {config.split}",
+    )
+    evaluation = Evaluation(
+        data=store.data,
+        subject=store.subject,
+        model=avatar.config.model.name,
+        split=config.split,
+        frames=frames,
+        wall_s=time.perf_counter() - start,
+        machine=machine_facts(),
+        device=str(device),
+        training=avatar.facts,
+        search=asdict(search),
+    )
+    log.info("\n%s\n\n%s", table(evaluation), timings_text(evaluation))
+    (folder / "frames.png").unlink(missing_ok=True)  # an older figure would not belong to these numbers
+    write_json(folder / "metrics.json", metrics_content(evaluation, {**asdict(config), "avatar": str(path)}))
+    log.info("metrics: %s", folder / "metrics.json")
+    if config.figure:
+        from snarfcli.evaluation.figure import write_figure
+
+        write_figure(
+            folder / "frames.png",
+            avatar,
+            store.faces,
+            sequences,
+            frames,
+            count=config.figure_frames,
+            resolution=config.figure_resolution,
+        )
+        log.info("figure: %s", folder / "frames.png")
+
+
+def _check(config: EvalConfig) -> None:
+    """Refuse settings that cannot be used, before any work starts."""
+    if config.split not in SPLITS:
+        raise UserError(f"split must be id or ood, got '{config.split}'{nearest(config.split, SPLITS)}")
+    for name, least in (("max_frames", 1), ("points", 2), ("figure_frames", 1), ("figure_resolution", 16)):
+        value = getattr(config, name)
+        if value is not None and value < least:
+            raise UserError(f"{name} must be at least {least}, got {value}")
+    samples = samples_folder(config.data_root, config.data.name, config.subject)
+    if config.data.name == "builtin" and not samples.exists():
+        builtin_subject(config.subject)  # says so, and which name is near, if there is no such subject
+    if config.search is not None and config.search.name not in _SEARCHES:
+        name = config.search.name
+        raise UserError(f"search.name must be {' or '.join(_SEARCHES)}, got '{name}'{nearest(name, _SEARCHES)}")
+
+
+def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None:
+    """Refuse an avatar of another skeleton; say so where it is of another subject or was trained on other data."""
+    theirs, ours = avatar.skeleton, store.skeleton
+    if theirs.parents != ours.parents:
+        raise UserError(
+            f"the avatar has {theirs.num_joints} joints and the samples of subject {store.subject} have {ours.num_joints}, "
+            "or they are joined otherwise; evaluate it on the data that it was trained on"
+        )
+    bones = config.search.init_bones if config.search is not None else None
+    if bones is not None and not (bones and all(0 <= bone < ours.num_joints for bone in bones)):
+        raise UserError(f"search.init_bones must lie in 0..{ours.num_joints - 1}, got {bones}")
+    for name, wanted in (("subject", store.subject), ("data", store.data)):
+        trained_on = avatar.facts.get(name)
+        if trained_on is not None and str(trained_on) != wanted:
+            log.warning("warning: this avatar was trained on %s %s and is evaluated on %s %s", name, trained_on, name, wanted)
+
+
+def _folder_name(config: EvalConfig) -> str:
+    """Return where the results go; another search than the trained one must not replace the avatar's own results."""
+    return f"eval_{config.split}" + (f"_{config.search.name}" if config.search is not None else "")
+
+
+def _check_writable(folder: Path) -> None:
+    """Find out before the work, not after it, that its results cannot be kept."""
+    existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise UserError(f"cannot write results to {folder}: {existing} is not a writable folder; copy the run folder")

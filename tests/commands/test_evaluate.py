@@ -1,0 +1,240 @@
+"""`snarf eval` end to end: a bending capsule, and an untrained avatar whose prior is a capsule around its bone."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from toy_subject import toy_subject
+
+from snarfcli.commands.evaluate import EvalConfig, run
+from snarfcli.datasets.preprocessing import preprocess_subject
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.store import SampleStore
+from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
+from snarfcli.errors import UserError
+from snarfcli.evaluation import evaluate as module
+from snarfcli.models.avatar import Avatar
+from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
+from snarfcli.sampling import SamplingSettings
+from snarfcli.shape import ShapeConfig
+
+STEPS = {"train": 8, "test": 1, "ood": 1}
+
+
+def toy_avatar(skeleton, subject: str = "toy") -> Avatar:
+    """Return an untrained avatar: the capsule prior fills its one bone, and its second bone is missing."""
+    torch.manual_seed(0)
+    config = AvatarConfig(
+        ModelConfig(),
+        SkinningConfig(resolution=[12, 6, 6], width=8, depth=1),
+        SearchConfig(),
+        ShapeConfig(width=8, depth=2, skip_layers=[], condition_layer=None, geometric_init=False, prior_radius_m=0.1),
+    )
+    around = torch.tensor([[-0.1, -0.1, -0.1], [1.1, 0.1, 0.1]])
+    grid = CanonicalGrid.around(around, config.skinning.margin_m)
+    return Avatar(config, skeleton, grid, {"data": "builtin", "subject": subject, "steps": 0, "loss": float("nan")})
+
+
+@pytest.fixture(scope="module")
+def data_root(tmp_path_factory) -> Path:
+    """Processed samples of the toy."""
+    root = tmp_path_factory.mktemp("data")
+    preprocess_subject(toy_subject(), root, SamplingSettings(800, 0.01, 0.1, "winding", 0), STEPS)
+    return root
+
+
+@pytest.fixture
+def config(data_root: Path, tmp_path: Path) -> EvalConfig:
+    """Settings that evaluate the toy avatar, which lies in its run folder."""
+    output_root = tmp_path / "outputs"
+    store = SampleStore.open(data_root, "builtin", "toy")
+    toy_avatar(store.skeleton).save(output_root / "builtin" / "toy" / "fast_snarf" / "avatar.pt")
+    return EvalConfig(
+        subject="toy",
+        data=DataConfig("builtin", 8, 1, 1),
+        data_root=str(data_root),
+        output_root=str(output_root),
+        run="fast_snarf",
+        split="id",
+        ckpt=None,
+        max_frames=None,
+        points=None,
+        figure=False,
+        figure_frames=1,
+        figure_resolution=24,
+        device="cpu",
+        threads=None,
+        seed=0,
+    )
+
+
+def folder_of(config: EvalConfig) -> Path:
+    """Return the run folder."""
+    return Path(config.output_root) / "builtin" / "toy" / "fast_snarf"
+
+
+def read(path: Path) -> dict:
+    """Return a metrics file."""
+    return json.loads((path / "metrics.json").read_text())
+
+
+def test_the_numbers_are_those_of_the_avatar_on_the_samples(config, data_root):
+    run(config)
+    metrics = read(folder_of(config) / "eval_id")
+    store = SampleStore.open(data_root, "builtin", "toy")
+    (sequence,) = store.sequences("test")
+    avatar = Avatar.load(folder_of(config) / "avatar.pt")
+    wanted = []
+    for frame in range(sequence.num_frames):
+        pose, translation = torch.tensor(sequence.poses[[frame]]), torch.tensor(sequence.translation[[frame]])
+        inside = avatar.occupancy(torch.tensor(sequence.points(frame))[None], pose, translation)[0].numpy() > 0.5
+        truth = sequence.occupancies(frame)
+        halves = (slice(0, 400), slice(400, 800))
+        wanted.append([(inside & truth)[half].sum() / (inside | truth)[half].sum() for half in halves])
+    assert metrics["iou_bbox"] == pytest.approx(np.mean(wanted, 0)[0], abs=1e-6)
+    assert metrics["iou_surface"] == pytest.approx(np.mean(wanted, 0)[1], abs=1e-6)
+    assert 0.2 < metrics["iou_bbox"] < 0.8  # one of two bones
+
+
+def test_metrics_say_what_was_measured(config):
+    run(config)
+    metrics = read(folder_of(config) / "eval_id")
+    assert {name: metrics[name] for name in ("data", "subject", "model", "split", "frames", "seed")} == {
+        "data": "builtin", "subject": "toy", "model": "fast_snarf", "split": "id", "frames": 3, "seed": 0,
+    }  # fmt: skip
+    assert list(metrics["sequences"]) == ["wave"]
+    assert metrics["sequences"]["wave"]["per_frame"]["frame"] == [0, 1, 2]
+    assert metrics["search"]["name"] == "complete"
+    assert metrics["training"] == {"data": "builtin", "subject": "toy", "steps": 0, "loss": None}
+    assert metrics["settings"]["points"] is None
+    assert metrics["timings"]["points"] == 2400
+    assert metrics["timings"]["total_s"] > 0
+    assert {"snarf", "torch", "python"} <= set(metrics["versions"])
+    assert [path.name for path in (folder_of(config) / "eval_id").iterdir()] == ["metrics.json"]
+
+
+def test_out_of_distribution_goes_to_its_own_folder(config, caplog):
+    caplog.set_level(logging.INFO)
+    run(replace(config, split="ood", points=100, max_frames=1))
+    metrics = read(folder_of(config) / "eval_ood")
+    assert (metrics["split"], metrics["frames"], metrics["points_per_frame"]) == ("ood", 1, 100)
+    assert list(metrics["sequences"]) == ["fold"]
+    assert "out of distribution (ood)" in caplog.text
+    assert "time for 200,000 points" in caplog.text
+    assert str(folder_of(config) / "eval_ood" / "metrics.json") in caplog.text
+
+
+def test_another_search_leaves_the_avatars_own_results(config):
+    run(config)
+    run(replace(config, search=SearchConfig(name="broyden", init_bones=[0, 1], tolerance=5e-5)))
+    assert read(folder_of(config) / "eval_id")["search"]["name"] == "complete"
+    broyden = read(folder_of(config) / "eval_id_broyden")
+    assert broyden["search"]["init_bones"] == [0, 1]
+    assert broyden["settings"]["search"]["name"] == "broyden"
+
+
+def test_results_go_beside_a_given_checkpoint(config, tmp_path, caplog):
+    store = SampleStore.open(config.data_root, "builtin", "toy")
+    toy_avatar(store.skeleton, subject="somebody").save(tmp_path / "elsewhere" / "mine.pt")
+    run(replace(config, ckpt=str(tmp_path / "elsewhere" / "mine.pt")))
+    assert read(tmp_path / "elsewhere" / "eval_id")["frames"] == 3
+    assert not (folder_of(config) / "eval_id").exists()
+    assert "trained on subject somebody and is evaluated on subject toy" in caplog.text
+
+
+def test_no_avatar_names_the_command_that_makes_one(config):
+    (folder_of(config) / "avatar.pt").unlink()
+    with pytest.raises(UserError, match=r'no avatar in .*fast_snarf; run "snarf train subject=toy" or give ckpt=PATH'):
+        run(config)
+
+
+def test_no_samples_name_the_command_that_makes_them(config, tmp_path):
+    avatar = str(folder_of(config) / "avatar.pt")
+    with pytest.raises(UserError, match="no samples of subject 50002 .*snarf preprocess"):
+        run(replace(config, data_root=str(tmp_path / "nothing"), subject="50002", ckpt=avatar))
+
+
+def test_an_unknown_subject_is_named_with_the_nearest_one(config):
+    with pytest.raises(UserError, match="no built-in subject '50003'; did you mean '500"):
+        run(replace(config, subject="50003"))
+
+
+def test_an_avatar_of_another_skeleton_is_refused(config):
+    skeleton = SampleStore.open(config.data_root, "builtin", "toy").skeleton
+    joints = torch.cat([skeleton.joints_rest, torch.tensor([[1.0, 0, 0]])])
+    longer = replace(
+        skeleton,
+        names=("root", "middle", "tip"),
+        parents=(-1, 0, 1),
+        joints_rest=joints,
+        canonical_pose=torch.zeros(3, 3),
+    )
+    toy_avatar(longer).save(folder_of(config) / "avatar.pt")
+    with pytest.raises(UserError, match="the avatar has 3 joints and the samples of subject toy have 2"):
+        run(config)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"split": "odd"}, "split must be id or ood, got 'odd'; did you mean 'ood'"),
+        ({"max_frames": 0}, "max_frames must be at least 1, got 0"),
+        ({"points": 1}, "points must be at least 2, got 1"),
+        ({"figure_resolution": 4}, "figure_resolution must be at least 16"),
+        ({"search": SearchConfig(name="broiden")}, "search.name must be .* did you mean 'broyden'"),
+        ({"search": SearchConfig(name="broyden", init_bones=[7])}, r"search.init_bones must lie in 0..1, got \[7\]"),
+        ({"search": SearchConfig(name="broyden", init_bones=[])}, r"search.init_bones must lie in 0..1, got \[\]"),
+    ],
+)
+def test_wrong_settings_are_named(config, changes, message):
+    with pytest.raises(UserError, match=message):
+        run(replace(config, **changes))
+    assert not list(folder_of(config).glob("eval*"))
+
+
+def test_an_interrupted_run_leaves_the_results_as_they_were(config, monkeypatch):
+    run(config)
+    before = (folder_of(config) / "eval_id" / "metrics.json").read_bytes()
+    calls = []
+
+    def interrupted(*arguments):
+        calls.append(arguments)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return measure(*arguments)
+
+    measure = module.measure_frame
+    monkeypatch.setattr(module, "measure_frame", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(config)
+    assert [path.name for path in (folder_of(config) / "eval_id").iterdir()] == ["metrics.json"]
+    assert (folder_of(config) / "eval_id" / "metrics.json").read_bytes() == before
+
+
+def test_a_folder_that_cannot_be_written_is_found_before_the_work(config, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(UserError, match="cannot write results to .*eval_id"):
+        run(config)
+
+
+def test_the_yaml_fits_the_settings():
+    from hydra import compose, initialize_config_dir
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import OmegaConf
+
+    from snarfcli.settings import config_folder
+
+    for name, schema in (("eval", EvalConfig), ("data", DataConfig), ("search", SearchConfig)):
+        ConfigStore.instance().store(group="schema", name=name, node=schema)
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        plain = OmegaConf.to_object(compose("eval"))
+        other = OmegaConf.to_object(compose("eval", ["search=broyden", "search.init_bones=[0,1]", "split=ood"]))
+    assert isinstance(plain, EvalConfig)
+    assert (plain.search, plain.run, plain.split, plain.data.name) == (None, "fast_snarf", "id", "builtin")
+    assert (other.search.name, other.search.init_bones, other.split) == ("broyden", [0, 1], "ood")

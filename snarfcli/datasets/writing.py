@@ -169,9 +169,12 @@ def discard_samples(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what interrupted runs left unfinished, and folders that are empty."""
+    """Delete what an interrupted run left unfinished: partial sequences, a subject without sequences, empty folders."""
     for partial in folder.glob(f"*/.*{_PARTIAL}"):
         shutil.rmtree(partial, ignore_errors=True)
+    if not any(folder.glob("*/*/sequence.json")):
+        with contextlib.suppress(OSError):
+            (folder / "subject.npz").unlink(missing_ok=True)
     for empty in (*(folder / split for split in SPLITS), folder):
         with contextlib.suppress(OSError):
             empty.rmdir()

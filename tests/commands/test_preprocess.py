@@ -1,0 +1,190 @@
+"""`snarf preprocess` end to end on a bending capsule."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from toy_subject import toy_subject
+
+from snarfcli.commands import preprocess
+from snarfcli.commands.preprocess import PreprocessConfig
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.store import SampleStore
+from snarfcli.datasets.subjects import SubjectData
+from snarfcli.datasets.writing import SequenceWriter
+from snarfcli.errors import UserError
+from snarfcli.sampling import occupancies
+
+
+@pytest.fixture
+def subject(monkeypatch: pytest.MonkeyPatch) -> list[SubjectData]:
+    """Make the toy the only subject; a test may put another in its place."""
+    holder = [toy_subject()]
+
+    def load(name: str) -> SubjectData:
+        if name != "toy":
+            raise UserError(f"no built-in subject '{name}'")
+        return holder[0]
+
+    monkeypatch.setattr("snarfcli.datasets.subjects.BUILTIN_SUBJECTS", ("toy",))
+    monkeypatch.setattr("snarfcli.datasets.subjects.builtin_subject", load)
+    return holder
+
+
+def _config(root: Path, **changes: Any) -> PreprocessConfig:
+    return PreprocessConfig(**{
+        "subject": "toy", "data": DataConfig("builtin", 1, 1, 1), "data_root": str(root), "points_per_frame": 400,
+        "surface_noise_m": 0.01, "padding": 0.1, "inside_test": "winding", "workers": 2, "seed": 0, "overwrite": False,
+        "sequences": [], **changes,
+    })  # fmt: skip
+
+
+def _contents(root: Path) -> dict[str, bytes]:
+    folder = root / "processed" / "builtin" / "toy"
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_samples_do_not_depend_on_workers_or_interruptions(
+    tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    one, two = tmp_path / "one", tmp_path / "two"
+    preprocess.run(_config(one, workers=1))
+    assert "39 frames, 15600 samples in" in caplog.text and "samples/s" in caplog.text
+    assert "bytes a frame" in caplog.text and "label 0.000 % of the points differently" in caplog.text
+    preprocess.run(_config(two, sequences=["fold"]))
+    assert [entry["name"] for entry in json.loads(_contents(two)["manifest.json"])["sequences"]] == ["fold"]
+    caplog.clear()
+    preprocess.run(_config(two, workers=0))
+    assert "1 of 3 sequences are there already" in caplog.text
+    assert _contents(one) == _contents(two)
+
+    store = SampleStore.open(one, "builtin", "toy")
+    store.verify()
+    bend = store.sequences("train")[0]
+    assert bend.num_frames == 34  # two tasks
+    assert len({bend.points(frame).tobytes() for frame in range(34)}) == 34
+    for frame in (0, 30, 33):
+        points = bend.points(frame)
+        np.testing.assert_array_equal(bend.occupancies(frame), occupancies(bend.vertices(frame), store.faces, points))
+        np.testing.assert_allclose(bend.box(frame)[0], bend.vertices(frame).min(0))
+    # the bone transforms move the canonical mesh and joints onto the posed ones
+    weights, canonical = store.vertex_weights, np.pad(store.canonical_vertices, ((0, 0), (0, 1)), constant_values=1)
+    posed = np.einsum("vj,tjrc,vc->tvr", weights, bend.bone_transforms[:, :, :3], canonical)
+    np.testing.assert_allclose(posed[8], bend.vertices(8), atol=2e-6)  # fp32 transforms of 1 m
+    joints = torch.cat([store.skeleton.canonical_joints, torch.ones(2, 1)], 1).numpy()
+    moved = np.einsum("tjrc,jc->tjr", bend.bone_transforms[:, :, :3], joints)
+    np.testing.assert_allclose(moved, bend.joints, atol=2e-6)
+
+    before = _contents(one)
+    preprocess.run(_config(one))
+    assert _contents(one) == before
+
+
+def test_settings_are_not_mixed(tmp_path: Path, subject: list[SubjectData]) -> None:
+    few = {"sequences": ["fold"], "workers": 1}
+    preprocess.run(_config(tmp_path, **few))
+    before = _contents(tmp_path)
+    with pytest.raises(UserError, match=r"other settings \(padding 0.1 -> 0.3, seed 0 -> 5\).*overwrite=true"):
+        preprocess.run(_config(tmp_path, seed=5, padding=0.3, **few))
+    with pytest.raises(UserError, match="train_frame_step 1 -> 2"):
+        preprocess.run(_config(tmp_path, data=DataConfig("builtin", 2, 1, 1), **few))
+    subject[0] = toy_subject()
+    subject[0].sequences[2].motion.poses[0, 1, 0] += 0.1
+    with pytest.raises(UserError, match=r"fold was made from another motion \(poses differs\)"):
+        preprocess.run(_config(tmp_path, **few))
+    body = replace(subject[0].body, v_template=subject[0].body.v_template * 1.1)
+    subject[0] = replace(subject[0], body=body)
+    with pytest.raises(UserError, match="made from another body"):
+        preprocess.run(_config(tmp_path, **few))
+    assert _contents(tmp_path) == before
+    preprocess.run(_config(tmp_path, overwrite=True, seed=5, inside_test="parity", **few))
+    manifest = json.loads(_contents(tmp_path)["manifest.json"])
+    assert manifest["settings"]["seed"] == 5 and manifest["settings"]["inside_test"] == "parity"
+    assert _contents(tmp_path)["ood/fold/points.npy"] != before["ood/fold/points.npy"]
+
+
+@pytest.mark.parametrize("problem", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
+def test_an_interrupted_run_leaves_whole_sequences_only(
+    tmp_path: Path, subject: list[SubjectData], monkeypatch: pytest.MonkeyPatch, problem: BaseException
+) -> None:
+    write = SequenceWriter.write_frame
+
+    def stop_at_fold(self: SequenceWriter, frame: int, samples: Any) -> None:
+        if self.folder.name == "fold":
+            raise problem
+        write(self, frame, samples)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SequenceWriter, "write_frame", stop_at_fold)
+        with pytest.raises(type(problem)):
+            preprocess.run(_config(tmp_path, sequences=["wave", "fold"], workers=1))
+    assert {name.split("/")[1] for name in _contents(tmp_path) if "/" in name} == {"wave"}
+    assert not list(tmp_path.rglob(".*"))
+    with pytest.raises(UserError, match="unfinished"):
+        SampleStore.open(tmp_path, "builtin", "toy")
+    preprocess.run(_config(tmp_path, sequences=["wave", "fold"], workers=1))
+    assert len(SampleStore.open(tmp_path, "builtin", "toy").manifest["sequences"]) == 2
+
+
+def test_a_damaged_sequence_is_made_again(tmp_path: Path, subject: list[SubjectData]) -> None:
+    few = {"sequences": ["fold"], "workers": 1}
+    preprocess.run(_config(tmp_path, **few))
+    before = _contents(tmp_path)
+    path = tmp_path / "processed" / "builtin" / "toy" / "ood" / "fold" / "points.npy"
+    path.write_bytes(path.read_bytes()[:-10])
+    preprocess.run(_config(tmp_path, **few))
+    assert _contents(tmp_path) == before
+
+
+def test_an_open_mesh_is_said_once(
+    tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture
+) -> None:
+    body = subject[0].body
+    subject[0] = replace(subject[0], body=replace(body, faces=body.faces[1:]))
+    few = {"sequences": ["fold"], "workers": 1}
+    preprocess.run(_config(tmp_path, **few))
+    assert caplog.text.count("is open, 3 boundary edges: labelled by winding number") == 1
+    assert SampleStore.open(tmp_path, "builtin", "toy").manifest["boundary_edges"] == 3
+    with pytest.raises(UserError, match=r"is open \(3 boundary edges\).*inside_test=winding"):
+        preprocess.run(_config(tmp_path / "other", inside_test="parity", **few))
+    assert not _contents(tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"subject": "tot"}, "no built-in subject 'tot'"),
+        ({"data": DataConfig("biultin", 1, 1, 1)}, "no data set 'biultin'; did you mean 'builtin'"),
+        ({"data": DataConfig("builtin", 0, 1, 1)}, "frame step of train sequences must be at least 1, got 0"),
+        ({"sequences": ["bnd"]}, "no sequence 'bnd'; did you mean 'bend'"),
+        ({"workers": -1}, "workers: wanted"),
+        ({"points_per_frame": 30}, "multiple of 8"),
+        ({"inside_test": "rays"}, "inside_test"),
+    ],
+)
+def test_bad_values_make_nothing(tmp_path: Path, subject: list[SubjectData], changes: dict, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        preprocess.run(_config(tmp_path, **changes))
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_poses_are_named(tmp_path: Path, subject: list[SubjectData]) -> None:
+    subject[0].sequences[1].motion.poses[2, 0, 1] = np.nan
+    with pytest.raises(UserError, match="wave has NaN or infinite vertices in frame 2"):
+        preprocess.run(_config(tmp_path, sequences=["wave"]))
+    assert not _contents(tmp_path)
+
+
+def test_a_folder_that_cannot_be_made_is_an_os_error(tmp_path: Path, subject: list[SubjectData]) -> None:
+    (tmp_path / "processed").write_text("a file in the way")
+    with pytest.raises(OSError):
+        preprocess.run(_config(tmp_path))

@@ -23,7 +23,7 @@ __all__ = ["complete_roots", "posed_cell_boxes"]
 _QUERIES_AT_ONCE = 65_536  # bounds the memory: about 20 candidate cells of 450 bytes for a query near the body
 _BINS_PER_SIDE = 96
 _STRAY = 1.25  # cells from the centre at which a candidate is given up; a neighbour then owns the root, if there is one
-_FACE_TOLERANCE = 1e-4  # of a cell; a root on a face may be seen from just outside by both cells
+_FACE_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}  # of a cell; rounding may put a root on a face outside both
 _POLISH = 1e-2  # of a cell; so short a step leaves the Jacobian as it is
 _SAME_ROOT = 5e-3  # of a cell; Newton's last step leaves errors a hundred times smaller
 
@@ -153,6 +153,7 @@ def _newton(
     max_steps: int,
 ) -> Roots:
     """Run Newton's method for each pair of query and cell (SNARF Eq. 6 with the exact Jacobian); keep roots in the cell."""
+    reach = 0.5 + _FACE_TOLERANCE[points.dtype]
     local = points.new_full((len(query), 3), 0.5)
     found = [(query[:0], cell[:0], local[:0], points.new_empty(0, 3, 3))]
     for _ in range(max_steps):
@@ -167,7 +168,7 @@ def _newton(
         # A last, tiny step polishes a converged root; beside a fold, where it is not tiny, the point stays where it is.
         trusted = (~converged)[:, None] | (longest < _POLISH)
         local = torch.where(trusted, local - step / longest.clamp_min(1), local)
-        in_cell = ((local - 0.5).abs() <= 0.5 + _FACE_TOLERANCE).all(1)
+        in_cell = ((local - 0.5).abs() <= reach).all(1)
         done = (converged & in_cell).nonzero()[:, 0]
         found.append((query[done], cell[done], local[done], inverse[done] * cell_size[:, None]))
         going = (~converged & ((local - 0.5).abs() < _STRAY).all(1)).nonzero()[:, 0]

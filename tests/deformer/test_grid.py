@@ -1,0 +1,58 @@
+"""The grid's geometry and trilinear interpolation against SciPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import RegularGridInterpolator
+
+from snarfcli.deformer import CanonicalGrid
+from snarfcli.deformer.grid import cell_corners, locate, trilinear_gradients, trilinear_weights
+from snarfcli.deformer.skinning import interpolate
+from tests.deformer.scenes import unit_grid
+
+SHAPE = (3, 4, 6)
+
+
+def test_corners_of_a_cell_are_its_nodes():
+    grid = unit_grid()
+    nodes = grid.nodes(SHAPE).reshape(-1, 3)
+    cells = torch.arange(2 * 3 * 5)
+    corners = nodes[cell_corners(cells, SHAPE)]
+    size = grid.cell_size(SHAPE)
+    offsets = torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])
+    torch.testing.assert_close(corners, corners[:, :1] + offsets * size)
+    centres = corners.mean(1)
+    cell, local = locate(centres, grid, SHAPE)
+    assert torch.equal(cell, cells)
+    torch.testing.assert_close(local, torch.full_like(local, 0.5))
+
+
+def test_interpolation_agrees_with_scipy():
+    grid = unit_grid()
+    values = torch.rand(*SHAPE, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    points = grid.lower + torch.rand(200, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 2
+    axes = [np.linspace(grid.lower[a].item(), grid.upper[a].item(), n) for a, n in ((2, 3), (1, 4), (0, 6))]
+    wanted = RegularGridInterpolator(axes, values.numpy())(points.numpy()[:, ::-1])
+    np.testing.assert_allclose(interpolate(values, points, grid).numpy(), wanted, atol=1e-12)
+
+
+def test_interpolation_outside_takes_the_border():
+    grid = unit_grid()
+    values = torch.arange(SHAPE[2], dtype=torch.float64).expand(*SHAPE)[..., None]
+    far = torch.tensor([[5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(interpolate(values, far, grid)[:, 0], torch.tensor([5.0, 0.0], dtype=torch.float64))
+
+
+def test_gradients_of_the_weights_are_their_derivatives():
+    local = torch.rand(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    wanted = torch.stack([torch.autograd.functional.jacobian(trilinear_weights, point) for point in local])
+    torch.testing.assert_close(trilinear_gradients(local), wanted.transpose(1, 2))
+
+
+def test_a_box_turned_inside_out_is_refused():
+    with pytest.raises(ValueError, match=r"grid\.upper must exceed grid\.lower"):
+        CanonicalGrid(torch.zeros(3), torch.tensor([1.0, 0.0, 1.0]))
+    with pytest.raises(ValueError, match=r"grid\.lower must have shape \[3\], got \[2\]"):
+        CanonicalGrid(torch.zeros(2), torch.ones(3))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -75,6 +75,12 @@ def _betas(subject: str, count: int) -> NDArray[np.float64]:
     return np.clip(0.9 * np.random.default_rng([int(subject), 1]).standard_normal(count), -2.0, 2.0)
 
 
+def _leg_length(body: Body, betas: NDArray[np.float64] | None) -> float:
+    """Return the height of the pelvis above the soles in the rest pose, metres."""
+    vertices, joints = body.shaped(betas)
+    return float(joints[0, 1] - vertices[:, 1].min())
+
+
 def _sequence_names(subject: str) -> tuple[str, ...]:
     """Return the subject's ten sequences in TRAINING_SEQUENCES' order, the held-out one among them."""
     held_out = HELD_OUT_SEQUENCES[subject]
@@ -103,5 +109,11 @@ def builtin_subject(subject: str | int) -> SubjectData:
     names = _sequence_names(subject)
     splits: list[tuple[str, Split]] = [(name, "train") for name in names if name != held_out]
     splits += [(held_out, "test"), *((name, "ood") for name in OUT_OF_DISTRIBUTION_SEQUENCES)]
-    sequences = tuple(SequenceSpec(name, split, builtin_motion(name, int(subject))) for name, split in splits)
-    return SubjectData("builtin", subject, body, betas, body.skeleton(betas), sequences)
+    size = _leg_length(body, betas) / _leg_length(body, None)
+    sequences = []
+    for name, split in splits:
+        motion = builtin_motion(name, int(subject))
+        # Steps and hops grow with the legs, so that this person's feet stay on this person's floor.
+        motion = replace(motion, translation=motion.translation * size)
+        sequences.append(SequenceSpec(name, split, motion))
+    return SubjectData("builtin", subject, body, betas, body.skeleton(betas), tuple(sequences))

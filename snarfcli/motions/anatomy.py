@@ -41,7 +41,7 @@ _UNPAIRED = {
     "head_nod": (-65, 55), "head_tilt": (-40, 40), "head_turn": (-75, 75),
 }  # fmt: skip
 _PAIRED = {
-    "hip_flex": (-40, 130), "hip_abd": (-25, 85), "hip_rot": (-45, 60), "knee": (0, 145),
+    "hip_flex": (-40, 130), "hip_abd": (-25, 85), "hip_rot": (-45, 95), "knee": (0, 145),
     "ankle": (-50, 35), "toe": (-30, 60),
     "shrug": (-10, 30), "protract": (-25, 25), "arm_flex": (-60, 180), "arm_abd": (-45, 180), "arm_roll": (-90, 90),
     "elbow": (0, 150), "pron": (-85, 85), "wrist_flex": (-70, 75), "wrist_dev": (-20, 35), "curl": (-15, 80),

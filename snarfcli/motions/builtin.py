@@ -16,20 +16,23 @@ from snarfcli.motions.motion import Motion
 
 __all__ = ["OUT_OF_DISTRIBUTION_SEQUENCES", "TRAINING_SEQUENCES", "builtin_motion"]
 
+_EXERCISE_S = 4.0
+_EXTREME_S = 8.0  # key poses at the pace of a stretching exercise
+
 TRAINING_SEQUENCES: tuple[str, ...] = tuple(EXERCISES)
 """Exercises, by DFaust's names."""
 OUT_OF_DISTRIBUTION_SEQUENCES: tuple[str, ...] = tuple(EXTREMES)
 """Extremes inside the limits of the joints, in the place of PosePrior's seven sequences."""
 
 
-def builtin_motion(name: str, seed: int = 0, *, duration_s: float = 4.0, frame_rate: float = 60.0) -> Motion:
+def builtin_motion(name: str, seed: int = 0, *, duration_s: float | None = None, frame_rate: float = 60.0) -> Motion:
     """Make a motion of SMPL's 24 joints: y up, facing +z, on the spot, feet on the floor.
 
     Args:
         name: one of `TRAINING_SEQUENCES` or `OUT_OF_DISTRIBUTION_SEQUENCES`.
-        seed: whose motion it is: sizes, tempo, phase and noise follow from it. The same seed gives the same motion; the
-            frame rate only chooses where it is looked at.
-        duration_s: length in seconds.
+        seed: whose motion it is: sizes, tempo, phase and noise follow from it. The same seed gives the same motion,
+            whatever the frame rate it is looked at.
+        duration_s: length in seconds; 4 for exercises and 8 for extremes by default.
         frame_rate: frames a second.
 
     Raises:
@@ -39,6 +42,8 @@ def builtin_motion(name: str, seed: int = 0, *, duration_s: float = 4.0, frame_r
     if name not in EXERCISES and name not in EXTREMES:
         known = (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES)
         raise UserError(f"no built-in motion '{name}'{nearest(name, known)} Known are {', '.join(known)}")
+    if duration_s is None:
+        duration_s = _EXERCISE_S if name in EXERCISES else _EXTREME_S
     frames = round(duration_s * frame_rate) if duration_s > 0 and frame_rate > 0 else 0
     if frames < 1:
         raise ValueError(f"duration_s, frame_rate: wanted at least one frame, got {duration_s} s at {frame_rate} a second")
@@ -51,5 +56,5 @@ def builtin_motion(name: str, seed: int = 0, *, duration_s: float = 4.0, frame_r
         for side, path in scene.feet.items():
             poses = plant_foot(poses, translation, side, path)
     else:
-        translation = stand_on_floor(poses) + scene.pelvis
+        translation = stand_on_floor(poses, frame_rate) + scene.pelvis
     return Motion(name, poses, translation, float(frame_rate))

@@ -34,8 +34,8 @@ def hop(phase: Array, period_s: float, height_m: float) -> tuple[Array, Array]:
     """Return the vertical way of a hopping body, once a cycle of `phase` (in cycles).
 
     Returns:
-        lift [T] metres: a ballistic arc in flight, and the dip on the ground that joins it without a kink; and the share of
-        flight [T], 0 on the ground, 1 at the top.
+        lift [T] metres: a ballistic arc in flight, and the dip on the ground that joins it without a kink; and the leg's
+        extension [T], 1 in flight, 0 in the middle of the contact.
     """
     flight_s = np.sqrt(8 * height_m / _GRAVITY)
     share = min(flight_s / period_s, 0.8)
@@ -44,9 +44,9 @@ def hop(phase: Array, period_s: float, height_m: float) -> tuple[Array, Array]:
     ground = 1 - share
     in_flight = u >= ground
     w = np.where(in_flight, (u - ground) / share, 0.0)
-    arc = 4 * w * (1 - w)
     dip = 4 * height_m * ground / (np.pi * share)
-    return np.where(in_flight, height_m * arc, -dip * np.sin(np.pi * np.minimum(u / ground, 1))), arc
+    sunk = np.where(in_flight, 0.0, np.sin(np.pi * np.minimum(u / ground, 1)))
+    return np.where(in_flight, 4 * height_m * w * (1 - w), -dip * sunk), 1 - sunk
 
 
 def through(t: Array, times: Sequence[float], values: Sequence[float]) -> Array:

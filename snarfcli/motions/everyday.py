@@ -36,12 +36,12 @@ def _stand(style: Style, t: Array) -> Scene:
         "pelvis_tilt": style.between(0, 4) + style.noise(t, 1.0),
         "pelvis_list": style.noise(t, 1.0),
         "pelvis_turn": style.noise(t, 2.0),
-        "spine_flex": style.between(-2, 6) + style.noise(t, 1.5),
-        "spine_bend": style.noise(t, 1.5),
-        "spine_twist": style.noise(t, 2.0),
-        "head_nod": style.between(0, 10) + style.noise(t, 3.0),
-        "head_tilt": style.noise(t, 2.0),
-        "head_turn": style.noise(t, 5.0),
+        "spine_flex": style.between(-4, 8) + style.noise(t, 3.0),
+        "spine_bend": style.noise(t, 2.5),
+        "spine_twist": style.noise(t, 4.0),
+        "head_nod": style.between(-4, 12) + style.noise(t, 6.0),
+        "head_tilt": style.noise(t, 4.0),
+        "head_turn": style.noise(t, 12.0, 0.1, 0.6),
     }
     abd, elbow = style.between(13, 19), style.between(10, 22)
     for side in "lr":
@@ -60,17 +60,17 @@ def _stand(style: Style, t: Array) -> Scene:
         side: FootPath(zero + sign * width, zero.copy(), zero + style.between(-0.03, 0.03), zero + yaw, zero.copy())
         for side, sign in (("l", 1), ("r", -1))
     }
-    sway = np.stack([style.noise(t, 0.008), style.noise(t, 0.003) - 0.022, style.noise(t, 0.008)], 1)
+    sway = np.stack([style.noise(t, 0.008), style.noise(t, 0.0015) - style.between(0.005, 0.012), style.noise(t, 0.008)], 1)
     return Scene(angles, sway, feet)
 
 
-def _hopping(scene: Scene, lift: Array, flight: Array, sides: str = "lr", point_deg: float = 38.0) -> None:
-    """Move pelvis and feet up and down with a hop; the feet point at the floor in flight."""
-    scene.pelvis[:, 1] += lift
+def _hopping(scene: Scene, lift: Array, extension: Array, sides: str = "lr", point_deg: float = 30.0) -> None:
+    """Move pelvis and feet up and down with a hop on the balls of the feet, which point at the floor in flight."""
+    scene.pelvis[:, 1] += lift + 0.0017 * point_deg  # a lifted heel lengthens the leg
     for side in sides:
         foot = scene.feet[side]
         foot.y = foot.y + np.maximum(lift, 0)
-        foot.heel = foot.heel + point_deg * np.sqrt(flight)
+        foot.heel = foot.heel + point_deg * (0.2 + 0.8 * extension)
 
 
 def _add(scene: Scene, **angles: Array | float) -> None:
@@ -87,7 +87,7 @@ def _chicken_wings(style: Style, t: Array) -> Scene:
         flap = 0.5 - 0.5 * np.cos(_TURN * (phase + delay))
         scene.angles |= {
             f"{side}_arm_abd": low + (high - low) * flap + style.noise(t, 2),
-            f"{side}_arm_flex": style.around(12, 0.5) + 12 * flap + style.noise(t, 2),
+            f"{side}_arm_flex": style.around(22, 0.3) + 10 * flap + style.noise(t, 2),
             f"{side}_arm_roll": -style.around(50) - 14 * flap + style.noise(t, 2),
             f"{side}_elbow": style.around(122, 0.04) + 8 * flap + style.noise(t, 1.5),
             f"{side}_pron": style.around(35) + style.noise(t, 3),
@@ -117,7 +117,7 @@ def _hips(style: Style, t: Array) -> Scene:
         scene.angles |= {
             f"{side}_arm_abd": style.around(46, 0.08) + style.noise(t, 2),
             f"{side}_arm_flex": -style.around(14, 0.3) + style.noise(t, 2),
-            f"{side}_arm_roll": -style.around(38, 0.12) + style.noise(t, 2),
+            f"{side}_arm_roll": -style.around(44, 0.1) + style.noise(t, 2),
             f"{side}_elbow": style.around(88, 0.06) + style.noise(t, 2),
             f"{side}_pron": style.around(30) + style.noise(t, 2),
             f"{side}_wrist_flex": -style.around(25, 0.3) + style.noise(t, 2),
@@ -154,12 +154,11 @@ def _jumping_jacks(style: Style, t: Array) -> Scene:
     tempo = style.around(0.95, 0.1)
     phase = style.phase(t, tempo)
     # Two hops a cycle: legs go apart in the first flight, together in the second.
-    lift, flight = hop(2 * phase, 0.5 / tempo, style.around(0.055, 0.3))
+    lift, extension = hop(2 * phase, 0.5 / tempo, style.around(0.045, 0.25))
     opened = 0.5 - 0.5 * np.cos(_TURN * (phase - 0.09))
-    opened = opened + 0.09 * np.sin(2 * _TURN * (phase - 0.09)) * 0
-    _hopping(scene, lift, flight)
+    _hopping(scene, lift, extension)
     width = style.around(0.26, 0.12)
-    scene.pelvis[:, 1] -= 0.055 * opened
+    scene.pelvis[:, 1] -= 0.045 * opened
     raised = style.around(158, 0.08)
     for side, sign in (("l", 1), ("r", -1)):
         scene.feet[side].x = scene.feet[side].x + sign * width * opened
@@ -200,10 +199,10 @@ def _knees(style: Style, t: Array) -> Scene:
 
 def _light_hopping(style: Style, t: Array, loose: float) -> Scene:
     scene = _stand(style, t)
-    tempo = style.around(1.9, 0.1)
+    tempo = style.around(2.15, 0.1)
     phase = style.phase(t, tempo)
-    lift, flight = hop(phase, 1 / tempo, style.around(0.05, 0.25))
-    _hopping(scene, lift, flight, point_deg=style.around(36, 0.2))
+    lift, extension = hop(phase, 1 / tempo, style.around(0.036, 0.25))
+    _hopping(scene, lift, extension, point_deg=style.around(30, 0.2))
     wave = np.sin(_TURN * phase)
     for side in "lr":
         late = np.sin(_TURN * (phase - 0.2 - style.between(0, 0.08)))
@@ -238,10 +237,10 @@ def _on_one_leg(style: Style, t: Array, scene: Scene) -> tuple[str, str, int]:
 def _one_leg_jump(style: Style, t: Array) -> Scene:
     scene = _stand(style, t)
     stance, free, _ = _on_one_leg(style, t, scene)
-    tempo = style.around(1.65, 0.1)
+    tempo = style.around(1.8, 0.1)
     phase = style.phase(t, tempo)
-    lift, flight = hop(phase, 1 / tempo, style.around(0.06, 0.25))
-    _hopping(scene, lift, flight, stance)
+    lift, extension = hop(phase, 1 / tempo, style.around(0.045, 0.25))
+    _hopping(scene, lift, extension, stance)
     wave, late = np.sin(_TURN * phase), np.sin(_TURN * (phase - 0.2))
     foot = scene.feet[free]
     foot.y = foot.y + style.around(0.26, 0.25) + lift + 0.02 * late
@@ -319,23 +318,24 @@ def _running_on_spot(style: Style, t: Array) -> Scene:
     scene = _stand(style, t)
     tempo = style.around(1.35, 0.1)
     phase = style.phase(t, tempo)
-    lift, _ = hop(2 * phase + 0.15, 0.5 / tempo, style.around(0.028, 0.3))
-    scene.pelvis[:, 1] += lift - 0.03
-    knee_high, heel_back = style.around(0.30, 0.2), style.around(0.10, 0.5)
+    # Each foot is down around its own half cycle; in between both are in the air.
+    lift, _ = hop(2 * phase - 0.17, 0.5 / tempo, style.around(0.03, 0.3))
+    scene.pelvis[:, 1] += lift + 0.03
+    knee_high, heel_back = style.around(0.34, 0.2), style.around(0.16, 0.3)
     pump = style.around(34, 0.2)
     for side, sign, delay in (("l", 1, 0.0), ("r", -1, 0.5)):
-        swing = pulse(phase, delay + 0.25, 0.66)
-        late = pulse(phase, delay + 0.19, 0.6)
+        swing = pulse(phase, delay + 0.25, 0.72)
+        late = pulse(phase, delay + 0.17, 0.62)
         foot = scene.feet[side]
         foot.y = foot.y + knee_high * swing
-        foot.z = foot.z + 0.09 * swing - heel_back * late
-        foot.heel = foot.heel + style.around(48, 0.15) * late
+        foot.z = foot.z + 0.12 * swing - heel_back * late
+        foot.heel = foot.heel + 12 + style.around(44, 0.15) * late
         foot.yaw = foot.yaw * 0.5
         beat = np.cos(_TURN * (phase - delay - 0.25))  # this arm goes back when this knee is up
         scene.angles |= {
             f"{side}_arm_flex": 4 - pump * beat + style.noise(t, 2),
-            f"{side}_arm_abd": style.around(17, 0.2) + style.noise(t, 2),
-            f"{side}_arm_roll": -style.around(14, 0.4) + style.noise(t, 2),
+            f"{side}_arm_abd": style.around(24, 0.15) + style.noise(t, 2),
+            f"{side}_arm_roll": -style.around(4, 0.8) + style.noise(t, 2),
             f"{side}_elbow": style.around(86, 0.1) - 14 * beat + style.noise(t, 2),
             f"{side}_curl": 55 + style.noise(t, 3),
         }

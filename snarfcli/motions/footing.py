@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS, joint_positions
@@ -20,6 +21,12 @@ FLOOR_Y = -1.17
 # A knee never locks: the leg's reach is eased into this share of its full length, where the solution would turn singular.
 _REACH = 0.997
 _EASE_M = 0.012
+
+# Width of the soft minimum that finds the lowest point, metres.
+_SOFT_M = 0.008
+
+# How long a body takes to come to rest on the floor, seconds.
+_GIVE_S = 0.04
 
 # Points that can touch the floor: joint, offset in the joint's frame, radius of the flesh around it, metres.
 _CONTACTS = (
@@ -107,15 +114,27 @@ def _frame(along: Array, towards: Array) -> Array:
     return np.stack([first, second, np.cross(first, second)], -1)
 
 
-def stand_on_floor(poses: Array) -> Array:
-    """Return the translation [T, 3] that lets the lowest point of the body touch the floor in every frame."""
+def stand_on_floor(poses: Array, frame_rate: float) -> Array:
+    """Return the translation with which the body rests on the floor, and what rests on it does not slide.
+
+    Args:
+        poses: [T, 24, 3] axis-angle, radians.
+        frame_rate: frames a second.
+
+    Returns:
+        [T, 3] metres. Up: the lowest point touches the floor. Sideways and forwards: the points on the floor stay where they
+        are from frame to frame, and the way as a whole is centred.
+    """
     positions, rotations = joint_positions(poses)
-    heights = [
-        positions[:, joint, 1] + rotations[:, joint, 1] @ np.asarray(offset) - radius for joint, offset, radius in _CONTACTS
-    ]
-    # A soft minimum over half a centimetre: no jerk when another point takes over.
-    heights_m = np.stack(heights, 1)
-    soft = -0.005 * np.logaddexp.reduce(-heights_m / 0.005, axis=1)
-    translation = np.zeros((len(poses), 3))
-    translation[:, 1] = FLOOR_Y - soft
-    return translation
+    points = np.stack([positions[:, joint] + rotations[:, joint] @ np.asarray(at) for joint, at, _ in _CONTACTS], 1)
+    heights = points[:, :, 1] - np.array([radius for _, _, radius in _CONTACTS])
+    # A soft minimum: no jerk when another point takes over.
+    lowest = -_SOFT_M * np.logaddexp.reduce(-heights / _SOFT_M, axis=1)
+    share = np.exp((lowest[:, None] - heights) / (3 * _SOFT_M))
+    share /= share.sum(1, keepdims=True)
+    slide = np.einsum("tc,tcx->tx", (share[1:] + share[:-1]) / 2, np.diff(points, axis=0))
+    translation = -np.concatenate([np.zeros((1, 3)), np.cumsum(slide, 0)])
+    translation -= (translation.max(0) + translation.min(0)) / 2
+    translation[:, 1] = FLOOR_Y - lowest
+    # A foot that lands or leaves would stop the body dead; flesh and knees give way for a few hundredths of a second.
+    return gaussian_filter1d(translation, _GIVE_S * frame_rate, axis=0, mode="nearest")

@@ -9,21 +9,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from omegaconf import MISSING, OmegaConf
 
-from snarfcli.bodies import Skeleton
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.store import SampleStore
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
 from snarfcli.models.avatar import Avatar, load_checkpoint
-from snarfcli.models.extent import unpose_by_nearest_bone
 from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.shape import ShapeConfig
+from snarfcli.training.extent import rough_canonical_surface
 from snarfcli.training.loop import train
 from snarfcli.training.settings import TrainingConfig
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Trainer
@@ -31,7 +28,6 @@ from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Tra
 __all__ = ["TrainConfig", "run"]
 
 log = logging.getLogger(__name__)
-_FRAMES_FOR_EXTENT = 8
 
 
 @dataclass
@@ -90,8 +86,9 @@ def run(config: TrainConfig) -> None:
 
     avatar_config = AvatarConfig(config.model, config.skinning, config.search, config.shape)
     facts = {"data": config.data.name, "subject": config.subject, "seed": config.seed, "training": config.training.name}
-    grid = canonical_grid(store, config.skinning)
-    avatar = Avatar(avatar_config, store.skeleton, grid, facts)
+    surface = rough_canonical_surface(store)
+    grid = CanonicalGrid.around(surface, config.skinning.margin_m)
+    avatar = Avatar(avatar_config, store.skeleton, grid, surface, facts)
     trainer = Trainer(avatar, store, config.training, config.seed, device)
     if config.resume and checkpoint.exists():
         state = load_checkpoint(checkpoint, CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
@@ -125,27 +122,6 @@ def run(config: TrainConfig) -> None:
             100 * validation["iou_surface"],
         )
     log.info("avatar: %s", folder / "avatar.pt")
-
-
-def canonical_grid(store: SampleStore, skinning: SkinningConfig) -> CanonicalGrid:
-    """Return the canonical box of the weights: the body as far as it can be told without a template, plus margins.
-
-    The frames nearest to the canonical pose are taken back bone by bone (`unpose_by_nearest_bone`).
-    """
-    skeleton: Skeleton = store.skeleton
-    frames = [(s, int(f)) for s in store.sequences("train") for f in s.train_frames]
-    if not frames:
-        raise UserError('the samples hold no training frames; run "snarf preprocess" with the training sequences')
-    poses = np.stack([s.poses[f] for s, f in frames])
-    canonical = skeleton.canonical_pose.numpy()
-    distance = np.abs(poses[:, 1:] - canonical[None, 1:]).sum((1, 2))
-    points = [skeleton.canonical_joints.float()]
-    for index in np.argsort(distance, kind="stable")[:_FRAMES_FOR_EXTENT]:
-        sequence, frame = frames[index]
-        vertices = torch.as_tensor(np.asarray(sequence.vertices(frame)), dtype=torch.float32)
-        transforms = torch.as_tensor(np.asarray(sequence.bone_transforms[frame]), dtype=torch.float32)
-        points.append(unpose_by_nearest_bone(vertices, transforms, skeleton.to(torch.float32)))
-    return CanonicalGrid.around(torch.cat(points), skinning.margin_m)
 
 
 def _write_config(folder: Path, config: TrainConfig) -> None:

@@ -4,7 +4,7 @@ Usable alone, in any neural field: see `ForwardDeformer`.
 """
 
 from snarfcli.deformer.correspondences import Correspondences, find_correspondences
-from snarfcli.deformer.deformer import ForwardDeformer, SkinningConfig
+from snarfcli.deformer.deformer import ForwardDeformer, SkinningConfig, cells_near
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.search import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, skin
@@ -16,6 +16,7 @@ __all__ = [
     "SearchConfig",
     "SkinningConfig",
     "blend_transforms",
+    "cells_near",
     "find_correspondences",
     "skin",
 ]

@@ -15,7 +15,7 @@ from snarfcli.deformer.skinning import blend_transforms, interpolate, skin
 from snarfcli.deformer.weights import DistilledWeights
 from snarfcli.segments import distance_to_segments
 
-__all__ = ["ForwardDeformer", "SkinningConfig"]
+__all__ = ["ForwardDeformer", "SkinningConfig", "cells_near"]
 
 
 @dataclass
@@ -26,8 +26,10 @@ class SkinningConfig:
     """Grid nodes along x, y, z."""
     margin_m: list[float] = field(default_factory=lambda: [0.12, 0.12, 0.20])
     """What the grid's box adds around the canonical body on either side, along x, y, z, metres."""
-    active_radius_m: float | None = 0.22
+    bone_radius_m: float | None = 0.22
     """Cells with a corner this near to a bone are searched, metres; null searches every cell."""
+    surface_radius_m: float = 0.12
+    """So are cells this near to the rough canonical surface that the grid's box was made from, metres."""
     width: int = 128
     """Width of the network's hidden layers."""
     depth: int = 4
@@ -43,17 +45,23 @@ class ForwardDeformer(nn.Module):
 
     Args:
         grid: canonical box of the weight grid.
-        bones: canonical positions of the bones' ends, [S, 2, 3], metres; they say where the body may be.
         num_bones: J, the number of bone transforms.
         skinning: the weight field.
         search: how correspondences are found.
+        active_cells: bool [D-1, H-1, W-1], the cells that a complete search looks into (see `cells_near`); None for all.
     """
 
     def __init__(
-        self, grid: CanonicalGrid, bones: Tensor, num_bones: int, skinning: SkinningConfig, search: SearchConfig
+        self,
+        grid: CanonicalGrid,
+        num_bones: int,
+        skinning: SkinningConfig | None = None,
+        search: SearchConfig | None = None,
+        active_cells: Tensor | None = None,
     ) -> None:
         super().__init__()
-        self.search = search
+        skinning = skinning or SkinningConfig()
+        self.search = search or SearchConfig()
         self.num_bones = num_bones
         width, height, depth = skinning.resolution
         self.shape = (depth, height, width)
@@ -62,7 +70,9 @@ class ForwardDeformer(nn.Module):
         )
         self.register_buffer("lower", grid.lower.clone())
         self.register_buffer("upper", grid.upper.clone())
-        self.register_buffer("active_cells", cells_near_bones(grid, self.shape, bones, skinning.active_radius_m))
+        if active_cells is None:
+            active_cells = torch.ones([n - 1 for n in self.shape], dtype=torch.bool)
+        self.register_buffer("active_cells", active_cells.clone())
         self._frozen: Tensor | None = None
 
     @property
@@ -118,9 +128,14 @@ class ForwardDeformer(nn.Module):
             jacobian=self.search.jacobian,
         )
 
-    def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the corners (lower [3], upper [3]) of a posed box around the images of all active cells, metres."""
-        corners = cell_corners(self.active_cells.reshape(-1).nonzero()[:, 0], self.shape)
+    def posed_box(self, bone_transforms: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the corners (lower [3], upper [3]) of a box around the images of `cells` in one pose, metres.
+
+        Args:
+            bone_transforms: [J, 4, 4], canonical to posed.
+            cells: bool [D-1, H-1, W-1], at least one.
+        """
+        corners = cell_corners(cells.reshape(-1).nonzero()[:, 0], self.shape)
         origins = self.grid.nodes(self.shape).reshape(-1, 3)[corners[:, 0]]
         transforms = blend_transforms(self.weight_grid(), bone_transforms[None])[0][corners]
         lower, upper = posed_cell_boxes(transforms, origins, self.grid.cell_size(self.shape))
@@ -135,12 +150,18 @@ class ForwardDeformer(nn.Module):
         return skin(canonical, self.skinning_weights(canonical), bone_transforms)
 
 
-def cells_near_bones(
-    grid: CanonicalGrid, shape: tuple[int, int, int], bones: Tensor, radius: float | None
-) -> Tensor:
-    """Return which cells have a corner within `radius` metres of a bone, bool [D-1, H-1, W-1]; all for None."""
-    cells = [n - 1 for n in shape]
-    if radius is None:
-        return torch.ones(cells, dtype=torch.bool)
-    near = (distance_to_segments(grid.nodes(shape).reshape(-1, 3), bones) < radius).reshape(1, 1, *shape)
-    return torch.nn.functional.max_pool3d(near.float(), 2, stride=1)[0, 0] > 0
+def cells_near(grid: CanonicalGrid, shape: tuple[int, int, int], places: list[tuple[Tensor, float]]) -> Tensor:
+    """Return which cells have a corner near one of several places, bool [D-1, H-1, W-1].
+
+    Args:
+        grid: canonical box.
+        shape: nodes (D, H, W).
+        places: segments [S, 2, 3], metres, each with the distance that still counts as near, metres. A point is a segment
+            of no length.
+    """
+    nodes = grid.nodes(shape).reshape(-1, 3)
+    near = torch.zeros(len(nodes), dtype=torch.bool)
+    for segments, radius in places:
+        for some in segments.split(256):  # bounds the memory
+            near |= distance_to_segments(nodes, some) < radius
+    return torch.nn.functional.max_pool3d(near.reshape(1, 1, *shape).float(), 2, stride=1)[0, 0] > 0

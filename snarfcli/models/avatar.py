@@ -37,18 +37,26 @@ class Avatar:
         config: architecture.
         skeleton: joint tree, rest joints and canonical pose.
         grid: canonical box that holds the body.
+        surface: rough canonical surface points, [K, 3], metres, for a new avatar; a saved one knows where to search.
         facts: plain facts about its making (data, subject, steps, ...), saved with it.
     """
 
     def __init__(
-        self, config: AvatarConfig, skeleton: Skeleton, grid: CanonicalGrid, facts: dict[str, Any] | None = None
+        self,
+        config: AvatarConfig,
+        skeleton: Skeleton,
+        grid: CanonicalGrid,
+        surface: Tensor | None = None,
+        facts: dict[str, Any] | None = None,
     ) -> None:
         if config.model.name not in _MODELS:
             raise ValueError(f"model.name must be one of {', '.join(_MODELS)}, got {config.model.name!r}")
         self.config = config
         self.skeleton = skeleton
         self.facts = dict(facts or {})
-        self.model = _MODELS[config.model.name](config, bone_segments(skeleton), skeleton.num_joints, grid)
+        surface = skeleton.canonical_joints if surface is None else surface
+        self.model = _MODELS[config.model.name](config, bone_segments(skeleton), skeleton.num_joints, grid, surface)
+        self._body_cells: Tensor | None = None
 
     # ---------------------------------------------------------------- files
     def save(self, path: str | Path) -> None:
@@ -83,7 +91,7 @@ class Avatar:
         try:
             config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"]))
             grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
-            avatar = cls(config, Skeleton.from_dict(content["skeleton"]), grid, content["facts"])
+            avatar = cls(config, Skeleton.from_dict(content["skeleton"]), grid, facts=content["facts"])
             avatar.model.load_state_dict(content["state"])
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OmegaConfBaseException) as error:
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
@@ -95,6 +103,7 @@ class Avatar:
         """Move the avatar to a device and freeze its skinning weights there."""
         self.model.to(device).eval()
         self.model.deformer.freeze()
+        self._body_cells = None
         return self
 
     @property
@@ -148,11 +157,23 @@ class Avatar:
 
     @torch.no_grad()
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the corners of a posed box that holds the whole body in one pose [J, 4, 4], metres.
+        """Return the corners (lower [3], upper [3]) of a box that holds the whole body in one pose [J, 4, 4], metres.
 
-        It bounds the images of all cells that the search looks into and that the body may fill.
+        It bounds the images of all cells that the canonical shape touches, and of their neighbours.
         """
-        return self.model.deformer.posed_box(bone_transforms.to(self.device))
+        if self._body_cells is None:
+            self._body_cells = self._cells_of_body()
+        return self.model.deformer.posed_box(bone_transforms.to(self.device), self._body_cells)
+
+    def _cells_of_body(self) -> Tensor:
+        """Return which grid cells the canonical shape touches in the canonical pose, or neighbours, bool [D-1, H-1, W-1]."""
+        deformer = self.model.deformer
+        nodes = deformer.grid.nodes(deformer.shape).reshape(-1, 3)
+        logits = self.canonical_logits(nodes, self.skeleton.canonical_pose.float()).reshape(1, 1, *deformer.shape)
+        corners = torch.nn.functional.max_pool3d(logits, 2, stride=1)
+        # One cell further, since thin parts may lie between the nodes and the pose moves the surface a little.
+        touched = (torch.nn.functional.max_pool3d(corners, 3, stride=1, padding=1)[0, 0] > 0) & deformer.active_cells
+        return touched if bool(touched.any()) else deformer.active_cells
 
     def mesh(
         self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field"

@@ -27,13 +27,18 @@ def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: 
     Returns:
         [V, 3], canonical frame, metres; wrong by a few centimetres near bent joints.
     """
-    ends = bone_segments(skeleton).to(vertices)
-    movers = torch.tensor([parent for parent, _ in skeleton.bones])
-    moved = bone_transforms[movers]
+    joints = skeleton.canonical_joints.to(vertices)
+    parents = {parent for parent, _ in skeleton.bones}
+    leaves = [(joint, joint) for joint in range(skeleton.num_joints) if joint not in parents]
+    # What lies beyond a last joint (fingers, toes, skull) is as near to that joint as to the end of its parent's bone.
+    pairs = torch.tensor(leaves + skeleton.bones)
+    ends, moved = joints[pairs], bone_transforms[pairs[:, 0]]
     posed = torch.einsum("src,sec->ser", moved[:, :3, :3], ends) + moved[:, None, :3, 3]
     along = posed[:, 1] - posed[:, 0]
     offset = vertices[:, None] - posed[:, 0]
     share = ((offset * along).sum(-1) / (along * along).sum(-1).clamp_min(1e-12)).clamp(0, 1)
-    nearest = (offset - share[..., None] * along).norm(dim=-1).argmin(1)
+    distance = (offset - share[..., None] * along).norm(dim=-1)
+    distance[:, : len(leaves)] -= 1e-4  # so that the last joint wins
+    nearest = distance.argmin(1)
     inverse = torch.linalg.inv(moved)[nearest]
     return (inverse[:, :3, :3] @ vertices[:, :, None])[:, :, 0] + inverse[:, :3, 3]

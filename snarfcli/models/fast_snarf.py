@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from snarfcli.deformer import CanonicalGrid, Correspondences, ForwardDeformer, SearchConfig, SkinningConfig
+from snarfcli.deformer import (
+    CanonicalGrid,
+    Correspondences,
+    ForwardDeformer,
+    SearchConfig,
+    SkinningConfig,
+    cells_near,
+)
 from snarfcli.precision import matmul_precision
 from snarfcli.shape import OccupancyNetwork, ShapeConfig
 
@@ -65,14 +72,22 @@ class FastSnarf(nn.Module):
         bones: canonical ends of the bones, [S, 2, 3], metres.
         num_bones: J.
         grid: canonical box of the skinning weights.
+        surface: rough canonical surface points, [K, 3], metres; with the bones they say where to search.
     """
 
-    def __init__(self, config: AvatarConfig, bones: Tensor, num_bones: int, grid: CanonicalGrid) -> None:
+    def __init__(self, config: AvatarConfig, bones: Tensor, num_bones: int, grid: CanonicalGrid, surface: Tensor) -> None:
         super().__init__()
         if config.model.blend not in ("logit", "probability"):
             raise ValueError(f"model.blend must be logit or probability, got {config.model.blend!r}")
         self.config = config
-        self.deformer = ForwardDeformer(grid, bones, num_bones, config.skinning, config.search)
+        skinning = config.skinning
+        active = None
+        if skinning.bone_radius_m is not None:
+            width, height, depth = skinning.resolution
+            points = surface[:, None].expand(-1, 2, -1)
+            places = [(bones, skinning.bone_radius_m), (points, skinning.surface_radius_m)]
+            active = cells_near(grid, (depth, height, width), places)
+        self.deformer = ForwardDeformer(grid, num_bones, skinning, config.search, active)
         self.shape = OccupancyNetwork(config.shape, 3 * (num_bones - 1), bones)
 
     def condition(self, pose: Tensor) -> Tensor:
@@ -96,10 +111,8 @@ class FastSnarf(nn.Module):
         found = self.deformer(points, bone_transforms)
         after_search = time.perf_counter()
         logits = self.canonical_logits(found.canonical, self.condition(pose), found.pose, precision)
-        if self.training:
-            combined = blend(logits, found, self.config.model)
-        else:
-            combined = found.maximum(logits, NO_CORRESPONDENCE)
+        blended = self.training
+        combined = blend(logits, found, self.config.model) if blended else found.maximum(logits, NO_CORRESPONDENCE)
         done = time.perf_counter()
         return FieldSamples(combined, found.found, len(found.query), after_search - start, done - after_search)
 

@@ -75,12 +75,10 @@ def test_every_root_solves_the_equation_and_its_jacobian_is_exact(search):
         residual = move(canonical, weights, transforms[b], grid) - points[b][result.query[mine] - 200 * b]
         assert residual.norm(dim=1).max() < 1e-6
         inside = ((canonical > grid.lower + 1e-3) & (canonical < grid.upper - 1e-3)).all(1)
-        step = 1e-6
-        columns = [
-            (move(canonical + step * e, weights, transforms[b], grid) - move(canonical - step * e, weights, transforms[b], grid))
-            / (2 * step)
-            for e in torch.eye(3, dtype=torch.float64)
-        ]
+        steps = 1e-6 * torch.eye(3, dtype=torch.float64)
+        ahead = [move(canonical + s, weights, transforms[b], grid) for s in steps]
+        behind = [move(canonical - s, weights, transforms[b], grid) for s in steps]
+        columns = [(front - back) / 2e-6 for front, back in zip(ahead, behind, strict=True)]
         product = torch.bmm(torch.stack(columns, 2), result.jacobian_inverse[mine])
         # Roots within a step of a cell's face see two different Jacobians in the difference; they are rare.
         error = (product - torch.eye(3, dtype=torch.float64)).abs().amax((1, 2))[inside]

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from snarfcli.export.camera import Camera
-from snarfcli.export.render import Look, render
+from snarfcli.export.render import render
 from snarfcli.meshing.mesh import Mesh
 
 

@@ -1,0 +1,296 @@
+"""`snarf animate`: meshes and a video of an avatar in motion."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import re
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import MISSING
+
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.subjects import BUILTIN_SUBJECTS, builtin_subject
+from snarfcli.errors import UserError, nearest
+from snarfcli.export.animation import Animation
+from snarfcli.export.meshes import MESH_WRITERS
+from snarfcli.export.stage import set_stage
+from snarfcli.export.video import write_video
+from snarfcli.files import read_json, write_json
+from snarfcli.meshing.extract import EmptySurface, FullSurface
+from snarfcli.meshing.mesh import Mesh
+from snarfcli.meshing.surfaces import SURFACES, canonical_surface
+from snarfcli.models.avatar import Avatar
+from snarfcli.motions import Motion, builtin_motion
+from snarfcli.motions.amass import read_motion
+from snarfcli.runs import choose_device, find_avatar, machine_facts, run_folder, set_threads
+
+__all__ = ["AnimateConfig", "run"]
+
+log = logging.getLogger(__name__)
+
+_RECORD = "animation.json"
+_VIDEO = "video.mp4"
+_LEAST_RESOLUTION = 16
+_LARGEST_PICTURE = 4096
+
+
+@dataclass
+class AnimateConfig:
+    """Settings of `snarf animate`."""
+
+    subject: str = MISSING
+    """Whose avatar, such as 50002."""
+    data: DataConfig = MISSING
+    """Which data the avatar was trained on."""
+    output_root: str = MISSING
+    """Folder with the runs; the avatar is <output_root>/<data>/<subject>/<run>/avatar.pt."""
+    run: str = MISSING
+    """Name of the run."""
+    ckpt: str | None = MISSING
+    """Avatar file or run folder to use instead; results go beside it."""
+    pose: str | None = MISSING
+    """AMASS-style .npz file with the motion; null for the built-in `motion`."""
+    up: str = MISSING
+    """Which way is up in the pose file: auto, y or z."""
+    motion: str = MISSING
+    """Built-in motion, such as jumping_jacks, if there is no pose file."""
+    motion_seed: int = MISSING
+    """Variant of the built-in motion."""
+    motion_frame_rate: float = MISSING
+    """Frames a second of the built-in motion."""
+    start: int = MISSING
+    """First frame."""
+    stop: int | None = MISSING
+    """Frame to stop before; null for the end."""
+    step: int = MISSING
+    """Take every so many frames; the video keeps the pace."""
+    max_frames: int | None = MISSING
+    """Stop after so many frames; null for all."""
+    surface: str = MISSING
+    """field (the union, watertight) or skinned (the canonical mesh moved by its skin)."""
+    resolution: int = MISSING
+    """Voxels along the longest side: 128, 256, 512 or any number from 16."""
+    meshes: bool = MISSING
+    """Whether to write a mesh a frame."""
+    format: str = MISSING
+    """Format of the meshes: ply or obj."""
+    weight_colors: bool = MISSING
+    """Whether vertices are coloured by their skinning weights."""
+    video: bool = MISSING
+    """Whether to draw a video."""
+    video_size: str = MISSING
+    """Pixels of the video: 512, or width x height such as 1280x720."""
+    azimuth_deg: float = MISSING
+    """Where the camera stands: degrees from straight ahead of the body towards its left."""
+    elevation_deg: float = MISSING
+    """Degrees that the camera looks down."""
+    output: str | None = MISSING
+    """Folder for the results; null for animation/<motion> beside the avatar."""
+    overwrite: bool = MISSING
+    """Start again, even over frames made with other settings."""
+    device: str = MISSING
+    """auto, cpu, cuda or cuda:N."""
+    threads: int | None = MISSING
+    """Threads for tensor work; null leaves PyTorch's choice."""
+
+
+def run(config: AnimateConfig) -> int:
+    """Write a mesh a frame, a video and `animation.json`; an interrupted run goes on where it stopped.
+
+    Returns:
+        0, or 1 if some frames have no surface.
+
+    Raises:
+        UserError: there is no avatar or no motion, or a setting cannot be used.
+    """
+    size = _check(config)
+    subject_folder = run_folder(config.output_root, config.data.name, config.subject, config.run).parent
+    unknown = config.data.name == "builtin" and config.subject not in BUILTIN_SUBJECTS
+    if unknown and config.ckpt is None and not subject_folder.exists():
+        builtin_subject(config.subject)  # says which name is near
+    path = find_avatar(config.output_root, config.data.name, config.subject, config.run, config.ckpt)
+    device = choose_device(config.device)
+    set_threads(config.threads)
+    avatar = Avatar.load(path, device)
+    motion, numbers = _selected(config, _read(config, avatar.skeleton.num_joints))
+    folder = Path(config.output) if config.output else path.parent / "animation" / _file_name(motion.name)
+    settings = _settings(config, path, motion, numbers)
+    _prepare(folder, settings, config.overwrite)
+    log.info("avatar: %s, on %s", path, device)
+    log.info("motion: %s, %d frames at %g a second", motion.name, motion.num_frames, motion.frame_rate)
+
+    start = time.perf_counter()
+    canonical = _canonical(config, avatar, motion)
+    animation = Animation(
+        avatar,
+        motion.name,
+        motion.poses,
+        motion.translation,
+        numbers,
+        surface=config.surface,
+        resolution=config.resolution,
+        folder=folder,
+        suffix=config.format if config.meshes else None,
+        weights_from=canonical,
+        weight_colors=config.weight_colors,
+    )
+    try:
+        if config.video:
+            stage = set_stage(
+                avatar,
+                motion.poses,
+                motion.translation,
+                canonical,
+                aspect=size[0] / size[1],
+                azimuth_rad=math.radians(config.azimuth_deg),
+                elevation_rad=math.radians(config.elevation_deg),
+            )
+            write_video(folder / _VIDEO, animation.pictures(stage, size), motion.frame_rate)
+        else:
+            for _ in animation.meshes():
+                pass
+    except KeyboardInterrupt:
+        done = len(animation.frames)
+        log.info("stopped after %d of %d frames; the same command goes on from there", done, len(numbers))
+        raise
+    record = _record(config, animation, motion, path, time.perf_counter() - start)
+    write_json(folder / _RECORD, {"complete": True, "settings": settings, **record})
+    return _report(config, animation, record["timings"])
+
+
+def _check(config: AnimateConfig) -> tuple[int, int]:
+    """Refuse settings that cannot be used, before any work starts; return the size of the video."""
+    for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("up", ("auto", "y", "z"))):
+        value = getattr(config, name)
+        if value not in choices:
+            raise UserError(f"{name} must be {' or '.join(choices)}, got '{value}'{nearest(value, choices)}")
+    for name, least in (("resolution", _LEAST_RESOLUTION), ("step", 1), ("max_frames", 1)):
+        value = getattr(config, name)
+        if value is not None and value < least:
+            raise UserError(f"{name} must be at least {least}, got {value}")
+    if not config.motion_frame_rate > 0:
+        raise UserError(f"motion_frame_rate must be positive, got {config.motion_frame_rate}")
+    if not abs(config.elevation_deg) < 90:
+        raise UserError(f"elevation_deg must be between -90 and 90, got {config.elevation_deg}")
+    if not (config.meshes or config.video):
+        raise UserError("nothing to make: both meshes and video are false")
+    size = re.fullmatch(r"\s*(\d+)(?:\s*x\s*(\d+))?\s*", config.video_size)
+    numbers = (int(size[1]), int(size[2] or size[1])) if size else (0, 0)
+    if not all(16 <= pixels <= _LARGEST_PICTURE for pixels in numbers):
+        raise UserError(
+            f"video_size must be a number such as 512 or 1280x720, 16 to {_LARGEST_PICTURE}, got {config.video_size}"
+        )
+    return numbers
+
+
+def _read(config: AnimateConfig, joints: int) -> Motion:
+    """Return the whole motion, with y up."""
+    if config.pose is not None:
+        return read_motion(config.pose, joints, up=config.up)
+    motion = builtin_motion(config.motion, config.motion_seed, frame_rate=config.motion_frame_rate)
+    if motion.poses.shape[1] != joints:
+        raise UserError(
+            f"motion {motion.name} has {motion.poses.shape[1]} joints, the avatar has {joints}; give a pose file of its own"
+        )
+    return motion
+
+
+def _selected(config: AnimateConfig, motion: Motion) -> tuple[Motion, list[int]]:
+    """Return the frames asked for and their numbers in the motion."""
+    numbers = list(range(*slice(config.start, config.stop, config.step).indices(motion.num_frames)))[: config.max_frames]
+    if not numbers:
+        raise UserError(
+            f"start={config.start}, stop={config.stop} leave no frame: {motion.name} has frames 0 to {motion.num_frames - 1}"
+        )
+    poses, translation = motion.poses[numbers], motion.translation[numbers]
+    return replace(motion, poses=poses, translation=translation, frame_rate=motion.frame_rate / config.step), numbers
+
+
+def _file_name(name: str) -> str:
+    """Return a motion's name as a folder's."""
+    return re.sub(r"[^\w.+-]+", "_", name).strip(".") or "motion"
+
+
+def _settings(config: AnimateConfig, avatar: Path, motion: Motion, numbers: list[int]) -> dict[str, Any]:
+    """Return what the frames depend on: frames of other settings must not be mixed with them."""
+    digest = hashlib.sha256(motion.poses.tobytes() + motion.translation.tobytes())
+    return {
+        "avatar_sha256": hashlib.sha256(avatar.read_bytes()).hexdigest(),
+        "motion_sha256": digest.hexdigest(),
+        "frames": [numbers[0], numbers[-1], config.step],
+        "surface": config.surface,
+        "resolution": config.resolution,
+        "format": config.format,
+        "weight_colors": config.weight_colors,
+    }
+
+
+def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
+    """Make the folder ready: keep frames of the same settings, refuse others, or start again."""
+    record = folder / _RECORD
+    old = None if overwrite or not record.exists() else read_json(record, "record of an animation").get("settings", {})
+    if old is not None:
+        changed = [name for name, value in settings.items() if old.get(name) != value]
+        if changed:
+            what = ", ".join(f"{name} {old.get(name)} (now {settings[name]})" for name in changed if "sha256" not in name)
+            what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
+            raise UserError(
+                f"{folder} holds frames made with {what}; give overwrite=true to replace them, or output=FOLDER"
+            )
+    else:
+        for stale in [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), folder / _VIDEO]:
+            stale.unlink(missing_ok=True)
+    write_json(record, {"complete": False, "settings": settings})
+
+
+def _canonical(config: AnimateConfig, avatar: Avatar, motion: Motion) -> Mesh | None:
+    """Return the canonical body in the first pose, for colours and for the camera; None if it has no surface."""
+    resolution = min(128, config.resolution) if config.weight_colors else min(64, config.resolution)
+    try:
+        return canonical_surface(avatar, torch.from_numpy(motion.poses[0]).float(), resolution)
+    except (EmptySurface, FullSurface):
+        return None
+
+
+def _record(config: AnimateConfig, animation: Animation, motion: Motion, avatar: Path, seconds: float) -> dict[str, Any]:
+    """Return the facts for `animation.json`."""
+    frames = animation.frames
+    return {
+        "config": asdict(config),
+        "avatar": str(avatar),
+        "motion": {"name": motion.name, "frames": motion.num_frames, "frame_rate": motion.frame_rate},
+        "video": _VIDEO if config.video else None,
+        "frames": [asdict(frame) for frame in frames],
+        "skipped": [{"frame": frame.frame, "reason": frame.problem} for frame in frames if frame.problem],
+        "timings": {
+            "total_s": round(seconds, 3),
+            "extraction_s": round(sum(frame.extraction_s for frame in frames), 3),
+            "rendering_s": round(sum(frame.rendering_s for frame in frames), 3),
+            "frames_a_second": round(len(frames) / max(seconds, 1e-9), 3),
+        },
+        **machine_facts(),
+    }
+
+
+def _report(config: AnimateConfig, animation: Animation, timings: dict[str, float]) -> int:
+    """Say what was made and where it is, and return the exit code."""
+    frames, folder = animation.frames, animation.folder
+    skipped = sum(frame.problem is not None for frame in frames)
+    kept = sum(frame.points == 0 and frame.problem is None for frame in frames)
+    log.info(
+        "%d frames in %.1f s, %.2f frames a second%s",
+        len(frames), timings["total_s"], timings["frames_a_second"], f"; {kept} were there already" if kept else "",
+    )  # fmt: skip
+    if config.meshes and skipped < len(frames):
+        log.info("meshes: %s", folder / f"frame_*.{config.format}")
+    if config.video:
+        log.info("video: %s", folder / _VIDEO)
+    if skipped:
+        log.warning("%d of %d frames have no surface; see %s", skipped, len(frames), folder / _RECORD)
+    return 1 if skipped else 0

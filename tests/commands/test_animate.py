@@ -1,0 +1,252 @@
+"""`snarf animate` end to end, on two capsules end to end and on an untrained avatar."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import trimesh
+from toy_avatar import LENGTH, RADIUS, ToyAvatar
+
+from snarfcli.cli import main
+from snarfcli.commands import animate
+from snarfcli.commands.animate import AnimateConfig, run
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.errors import UserError
+from snarfcli.meshing.extract import EmptySurface
+
+VOLUME = np.pi * RADIUS**2 * 2 * LENGTH + 4 / 3 * np.pi * RADIUS**3
+
+
+@pytest.fixture
+def toy(monkeypatch) -> ToyAvatar:
+    avatar = ToyAvatar()
+    monkeypatch.setattr(animate.Avatar, "load", classmethod(lambda cls, path, device: avatar))
+    return avatar
+
+
+@pytest.fixture
+def pose_file(tmp_path: Path) -> Path:
+    poses = np.zeros((6, 6))
+    poses[:, 1] = 0.3  # turned about the vertical
+    poses[:, 5] = np.linspace(0, 1.2, 6)
+    trans = np.stack([np.linspace(0, 0.5, 6), np.full(6, 0.9), np.zeros(6)], axis=1)
+    path = tmp_path / "wave.npz"
+    np.savez(path, poses=poses, trans=trans, mocap_framerate=24.0)
+    return path
+
+
+@pytest.fixture
+def config(tmp_path: Path, pose_file: Path, toy: ToyAvatar) -> AnimateConfig:
+    folder = tmp_path / "outputs" / "builtin" / "50002" / "fast_snarf"
+    folder.mkdir(parents=True)
+    (folder / "avatar.pt").write_bytes(b"the toy")
+    return AnimateConfig(
+        subject="50002",
+        data=DataConfig("builtin", 8, 1, 1),
+        output_root=str(tmp_path / "outputs"),
+        run="fast_snarf",
+        ckpt=None,
+        pose=str(pose_file),
+        up="y",
+        motion="jumping_jacks",
+        motion_seed=0,
+        motion_frame_rate=30.0,
+        start=0,
+        stop=None,
+        step=1,
+        max_frames=None,
+        surface="field",
+        resolution=32,
+        meshes=True,
+        format="ply",
+        weight_colors=False,
+        video=True,
+        video_size="64",
+        azimuth_deg=0.0,
+        elevation_deg=5.0,
+        output=None,
+        overwrite=False,
+        device="cpu",
+        threads=None,
+    )
+
+
+def folder_of(config: AnimateConfig) -> Path:
+    return Path(config.output_root) / "builtin" / "50002" / "fast_snarf" / "animation" / "wave"
+
+
+def record_of(config: AnimateConfig) -> dict:
+    return json.loads((folder_of(config) / "animation.json").read_text())
+
+
+def video_frames(path: Path) -> tuple[dict, list[np.ndarray]]:
+    reader = imageio_ffmpeg.read_frames(str(path))
+    facts = next(reader)
+    width, height = facts["size"]
+    return facts, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]
+
+
+def test_meshes_video_and_record(config, toy):
+    assert run(replace(config, video_size="80x64")) == 0
+    folder = folder_of(config)
+    names = [f"frame_{index:06d}.ply" for index in range(6)]
+    assert sorted(path.name for path in folder.iterdir()) == ["animation.json", *names, "video.mp4"]
+    solids = [trimesh.load(folder / name, process=False) for name in names]
+    for solid in solids:
+        assert solid.is_watertight and solid.volume == pytest.approx(VOLUME, rel=0.15)  # bends lose volume
+    # translation and global orientation are kept: the root end of the capsules travels with trans
+    assert solids[-1].bounds[0, 0] - solids[0].bounds[0, 0] == pytest.approx(0.5, abs=0.05)
+    assert solids[0].bounds[0, 1] == pytest.approx(0.9 - RADIUS, abs=0.02)
+    assert solids[0].vertices[:, 2].min() < -0.2
+    facts, frames = video_frames(folder / "video.mp4")
+    assert facts["size"] == (80, 64) and facts["fps"] == pytest.approx(24) and len(frames) == 6
+    assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1  # it moves
+    record = record_of(config)
+    assert record["complete"] and record["skipped"] == []
+    assert [frame["file"] for frame in record["frames"]] == names
+    assert all(frame["components"] == 1 and frame["points"] > 0 for frame in record["frames"])
+    assert record["motion"] == {"name": "wave", "frames": 6, "frame_rate": 24.0}
+
+
+def test_frame_range_step_and_pace(config):
+    assert run(replace(config, start=1, stop=6, step=2, max_frames=2, surface="skinned", format="obj")) == 0
+    folder = folder_of(config)
+    assert sorted(path.name for path in folder.glob("frame_*")) == ["frame_000000.obj", "frame_000001.obj"]
+    assert [frame["frame"] for frame in record_of(config)["frames"]] == [1, 3]
+    facts, frames = video_frames(folder / "video.mp4")
+    assert facts["fps"] == pytest.approx(12) and len(frames) == 2
+
+
+@pytest.mark.parametrize("surface", ["field", "skinned"])
+def test_weight_colors_differ_between_the_bones(config, surface):
+    assert run(replace(config, max_frames=1, weight_colors=True, surface=surface, video=False)) == 0
+    solid = trimesh.load(folder_of(config) / "frame_000000.ply", process=False)
+    colors = solid.visual.vertex_colors[:, :3].astype(int)
+    # the first bone starts where trans puts the root, the second ends a metre further
+    distance = np.linalg.norm(solid.vertices - (0, 0.9, 0), axis=1)
+    near, far = colors[distance < 1.5 * RADIUS].mean(axis=0), colors[distance > 2 * LENGTH - RADIUS].mean(axis=0)
+    assert np.abs(near - far).max() > 60
+    assert not (folder_of(config) / "video.mp4").exists()
+
+
+def test_an_interrupted_run_goes_on(config, toy, monkeypatch, caplog):
+    extract = animate.Animation._extract
+
+    def interrupted(self, index, frame):
+        if index == 3:
+            raise KeyboardInterrupt
+        return extract(self, index, frame)
+
+    monkeypatch.setattr(animate.Animation, "_extract", interrupted)
+    with caplog.at_level(logging.INFO), pytest.raises(KeyboardInterrupt):
+        run(config)
+    assert "stopped after 3 of 6 frames" in caplog.text
+    folder = folder_of(config)
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "animation.json", "frame_000000.ply", "frame_000001.ply", "frame_000002.ply",
+    ]  # fmt: skip
+    assert record_of(config)["complete"] is False
+    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.ply")}
+
+    monkeypatch.setattr(animate.Animation, "_extract", extract)
+    with caplog.at_level(logging.INFO):
+        assert run(config) == 0
+    assert "3 were there already" in caplog.text
+    assert {name: (folder / name).stat().st_mtime_ns for name in before} == before
+    assert len(video_frames(folder / "video.mp4")[1]) == 6
+    assert record_of(config)["complete"] is True
+
+
+def test_other_settings_are_refused_and_overwrite_starts_again(config):
+    short = replace(config, max_frames=2, video=False)
+    run(short)
+    with pytest.raises(UserError, match=r"resolution 32 \(now 24\); give overwrite=true to replace them, or output="):
+        run(replace(short, resolution=24))
+    with pytest.raises(UserError, match=r"frames \[0, 1, 1\] \(now \[0, 0, 1\]\)"):
+        run(replace(short, max_frames=1))
+    (Path(config.output_root) / "builtin" / "50002" / "fast_snarf" / "avatar.pt").write_bytes(b"trained again")
+    with pytest.raises(UserError, match="frames made with another avatar"):
+        run(short)
+    assert run(replace(short, max_frames=1, format="obj", overwrite=True)) == 0
+    assert sorted(path.name for path in folder_of(config).iterdir()) == ["animation.json", "frame_000000.obj"]
+    assert run(replace(short, output=str(folder_of(config).parent / "elsewhere"))) == 0
+
+
+def test_a_frame_without_surface_is_reported_and_the_rest_goes_on(config, toy, monkeypatch, caplog):
+    query = toy.query
+
+    def sometimes(points, transforms, pose):
+        samples = query(points, transforms, pose)
+        if 0.4 < pose[0, 1, 2] < 0.5:
+            samples.logits = samples.logits * 0 - 1
+        return samples
+
+    monkeypatch.setattr(toy, "query", sometimes)
+    assert run(config) == 1
+    assert "frame 2: the field is unoccupied" in caplog.text
+    record = record_of(config)
+    assert [skip["frame"] for skip in record["skipped"]] == [2]
+    assert record["frames"][2]["file"] is None
+    assert len(list(folder_of(config).glob("*.ply"))) == 5
+    assert len(video_frames(folder_of(config) / "video.mp4")[1]) == 6
+
+
+def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
+    toy.radius = -1.0
+    assert run(replace(config, max_frames=2, weight_colors=True)) == 1
+    assert len(record_of(config)["skipped"]) == 2
+    with pytest.raises(EmptySurface):
+        animate.canonical_surface(toy, toy.skeleton.canonical_pose, 32)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"surface": "feild"}, "surface must be field or skinned, got 'feild'; did you mean 'field'"),
+        ({"format": "stl"}, "format must be ply or obj, got 'stl'"),
+        ({"up": "x"}, "up must be auto or y or z"),
+        ({"resolution": 15}, "resolution must be at least 16, got 15"),
+        ({"step": 0}, "step must be at least 1"),
+        ({"max_frames": 0}, "max_frames must be at least 1"),
+        ({"start": 6}, "start=6, stop=None leave no frame: wave has frames 0 to 5"),
+        ({"meshes": False, "video": False}, "nothing to make"),
+        ({"video_size": "large"}, "video_size must be a number such as 512 or 1280x720"),
+        ({"video_size": "9000"}, "video_size must be"),
+        ({"elevation_deg": 90.0}, "elevation_deg must be between"),
+        ({"pose": None, "motion_frame_rate": 0.0}, "motion_frame_rate must be positive"),
+        ({"pose": None}, "motion jumping_jacks has 24 joints, the avatar has 2"),
+        ({"pose": None, "motion": "jumping_jaks"}, "did you mean 'jumping_jacks'"),
+        ({"pose": "nowhere.npz"}, "no pose file at nowhere.npz"),
+        ({"subject": "50003"}, "no built-in subject '50003'"),
+        ({"subject": "50004"}, 'no avatar in .*50004.*; run "snarf train subject=50004" or give ckpt=PATH'),
+        ({"ckpt": "nowhere.pt"}, "no avatar at nowhere.pt"),
+    ],
+    ids=lambda value: ",".join(value) if isinstance(value, dict) else "",
+)
+def test_what_a_user_can_get_wrong(config, change, message):
+    with pytest.raises(UserError, match=message):
+        run(replace(config, **change))
+    assert not folder_of(config).exists()
+
+
+def test_a_motion_of_another_skeleton_is_refused(config, tmp_path):
+    np.savez(tmp_path / "smpl.npz", poses=np.zeros((2, 72)), trans=np.zeros((2, 3)))
+    with pytest.raises(UserError, match="has 72 values a frame, wanted 6"):
+        run(replace(config, pose=str(tmp_path / "smpl.npz")))
+
+
+def test_the_command_line(config, pose_file, capsys):
+    arguments = [
+        "animate", "--pose", str(pose_file), "up=y", f"output_root={config.output_root}", "resolution=24", "max_frames=2",
+        "video_size=64", "device=cpu",
+    ]  # fmt: skip
+    assert main(arguments) == 0
+    assert len(video_frames(folder_of(config) / "video.mp4")[1]) == 2
+    assert main([*arguments, "resolution=32"]) == 2
+    assert "give overwrite=true" in capsys.readouterr().err

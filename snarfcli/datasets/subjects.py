@@ -101,7 +101,7 @@ def builtin_subject(subject: str | int) -> SubjectData:
     subject = str(subject)
     if subject not in HELD_OUT_SEQUENCES:
         raise UserError(
-            f"no built-in subject '{subject}'{nearest(subject, BUILTIN_SUBJECTS)} Known are {', '.join(BUILTIN_SUBJECTS)}"
+            f"no built-in subject '{subject}'{nearest(subject, BUILTIN_SUBJECTS) or '.'} Known are {', '.join(BUILTIN_SUBJECTS)}"
         )
     body = builtin_body()
     betas = _betas(subject, body.num_betas)

@@ -58,7 +58,7 @@ def read_motion(path: str | Path, num_joints: int = _SMPL_JOINTS, *, up: Up = "a
         raise UserError(f"pose file {path} has no 'poses'; it holds {found}; give an AMASS-style .npz file")
     values = _numbers(arrays["poses"], "poses", path)
     if values.ndim == 3 and values.shape[2] == 3:
-        values = values.reshape(len(values), -1)
+        values = values.reshape(len(values), 3 * values.shape[1])
     if values.ndim == 1 and len(values):
         values = values[None]
     if values.ndim != 2:
@@ -79,11 +79,9 @@ def read_motion(path: str | Path, num_joints: int = _SMPL_JOINTS, *, up: Up = "a
     poses = poses.reshape(frames, num_joints, 3).copy()
     translation = np.zeros((frames, 3))
     if "trans" in arrays:
-        translation = _numbers(arrays["trans"], "trans", path).reshape(-1, 3) if arrays["trans"].size else translation[:0]
+        translation = np.atleast_2d(_numbers(arrays["trans"], "trans", path))
         if translation.shape != (frames, 3):
-            raise UserError(
-                f"pose file {path}: trans has shape {list(arrays['trans'].shape)}, wanted [{frames}, 3], one for each pose"
-            )
+            raise UserError(f"pose file {path}: trans has shape {list(translation.shape)}, wanted [{frames}, 3]")
     if up == "auto":
         up = _up_axis(poses, width, "trans" in arrays)
         if up == "z":

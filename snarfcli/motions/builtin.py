@@ -9,7 +9,8 @@ import numpy as np
 from snarfcli.errors import UserError, nearest
 from snarfcli.motions.anatomy import poses_from_angles
 from snarfcli.motions.curves import Style
-from snarfcli.motions.everyday import EXERCISES
+from snarfcli.motions.exercises_standing import STANDING_EXERCISES
+from snarfcli.motions.exercises_stepping import STEPPING_EXERCISES
 from snarfcli.motions.extremes import EXTREMES, perform
 from snarfcli.motions.footing import plant_foot, stand_on_floor
 from snarfcli.motions.motion import Motion
@@ -19,7 +20,9 @@ __all__ = ["OUT_OF_DISTRIBUTION_SEQUENCES", "TRAINING_SEQUENCES", "builtin_motio
 _EXERCISE_S = 4.0
 _EXTREME_S = 8.0  # key poses at the pace of a stretching exercise
 
-TRAINING_SEQUENCES: tuple[str, ...] = tuple(EXERCISES)
+_EXERCISES = STANDING_EXERCISES | STEPPING_EXERCISES
+
+TRAINING_SEQUENCES: tuple[str, ...] = tuple(sorted(_EXERCISES))
 """Exercises, by DFaust's names."""
 OUT_OF_DISTRIBUTION_SEQUENCES: tuple[str, ...] = tuple(EXTREMES)
 """Extremes inside the limits of the joints, in the place of PosePrior's seven sequences."""
@@ -39,17 +42,17 @@ def builtin_motion(name: str, seed: int = 0, *, duration_s: float | None = None,
         UserError: there is no motion of this name.
         ValueError: duration or frame rate is not positive, or no frame fits.
     """
-    if name not in EXERCISES and name not in EXTREMES:
+    if name not in _EXERCISES and name not in EXTREMES:
         known = (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES)
-        raise UserError(f"no built-in motion '{name}'{nearest(name, known)} Known are {', '.join(known)}")
+        raise UserError(f"no built-in motion '{name}'{nearest(name, known) or '.'} Known are {', '.join(known)}")
     if duration_s is None:
-        duration_s = _EXERCISE_S if name in EXERCISES else _EXTREME_S
+        duration_s = _EXERCISE_S if name in _EXERCISES else _EXTREME_S
     frames = round(duration_s * frame_rate) if duration_s > 0 and frame_rate > 0 else 0
     if frames < 1:
         raise ValueError(f"duration_s, frame_rate: wanted at least one frame, got {duration_s} s at {frame_rate} a second")
     t = np.arange(frames) / frame_rate
     style = Style(np.random.default_rng([seed, zlib.crc32(name.encode())]))
-    scene = EXERCISES[name](style, t) if name in EXERCISES else perform(EXTREMES[name], style, t, duration_s)
+    scene = _EXERCISES[name](style, t) if name in _EXERCISES else perform(EXTREMES[name], style, t, duration_s)
     poses = poses_from_angles(scene.angles, frames)
     if scene.feet:
         translation = scene.pelvis

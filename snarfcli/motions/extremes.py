@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from snarfcli.motions.anatomy import LIMITS_DEG
 from snarfcli.motions.curves import Style, through
-from snarfcli.motions.everyday import Scene
+from snarfcli.motions.scene import Scene
 
 __all__ = ["EXTREMES", "perform"]
 

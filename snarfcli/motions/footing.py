@@ -20,7 +20,7 @@ FLOOR_Y = -1.17
 
 # A knee never locks: the leg's reach is eased into this share of its full length, where the solution would turn singular.
 _REACH = 0.997
-_EASE_M = 0.012
+_EASE_M = 0.006
 
 # Width of the soft minimum that finds the lowest point, metres.
 _SOFT_M = 0.008

@@ -1,0 +1,68 @@
+"""What a figure does, before it becomes poses, and the stand that every exercise starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snarfcli.motions.curves import Style
+from snarfcli.motions.footing import FootPath
+
+__all__ = ["Scene", "add", "stand"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Scene:
+    """What a figure does, before it becomes poses."""
+
+    angles: dict[str, Array]
+    """Degrees [T] by name."""
+    pelvis: Array
+    """[T, 3] metres from where the pelvis of a straight stand is. Without planted feet: above the floor."""
+    feet: dict[str, FootPath] = field(default_factory=dict)
+    """Paths of planted feet, by side; the other legs follow the angles. With none the lowest point touches the floor."""
+
+
+def stand(style: Style, t: Array) -> Scene:
+    """Someone standing at ease: arms hanging, a little sway, never quite still and never quite symmetric."""
+    zero = np.zeros_like(t)
+    angles = {
+        "pelvis_tilt": style.between(0, 4) + style.noise(t, 1.0),
+        "pelvis_list": style.noise(t, 1.0),
+        "pelvis_turn": style.noise(t, 2.0),
+        "spine_flex": style.between(-4, 8) + style.noise(t, 3.0),
+        "spine_bend": style.noise(t, 2.5),
+        "spine_twist": style.noise(t, 4.0),
+        "head_nod": style.between(-4, 12) + style.noise(t, 6.0),
+        "head_tilt": style.noise(t, 4.0),
+        "head_turn": style.noise(t, 12.0, 0.1, 0.6),
+    }
+    abd, elbow = style.between(13, 19), style.between(10, 22)
+    for side in "lr":
+        angles |= {
+            f"{side}_arm_flex": style.between(-2, 8) + style.noise(t, 2.0),
+            f"{side}_arm_abd": abd + style.between(-2, 2) + style.noise(t, 1.5),
+            f"{side}_arm_roll": style.between(-12, 6) + style.noise(t, 2.0),
+            f"{side}_elbow": elbow + style.noise(t, 2.5),
+            f"{side}_pron": style.between(5, 25) + style.noise(t, 4.0),
+            f"{side}_wrist_flex": style.between(-5, 12) + style.noise(t, 4.0),
+            f"{side}_wrist_dev": style.noise(t, 3.0),
+            f"{side}_curl": style.between(10, 30) + style.noise(t, 4.0),
+        }
+    width, yaw = style.between(-0.01, 0.07), style.between(4, 16)
+    feet = {
+        side: FootPath(zero + sign * width, zero.copy(), zero + style.between(-0.03, 0.03), zero + yaw, zero.copy())
+        for side, sign in (("l", 1), ("r", -1))
+    }
+    sway = np.stack([style.noise(t, 0.008), style.noise(t, 0.0015) - style.between(0.010, 0.017), style.noise(t, 0.008)], 1)
+    return Scene(angles, sway, feet)
+
+
+def add(scene: Scene, **angles: Array | float) -> None:
+    """Add degrees, a number or one a frame, to angles of the scene."""
+    for name, value in angles.items():
+        scene.angles[name] = scene.angles.get(name, 0.0) + value

@@ -1,0 +1,169 @@
+"""Shape, correctives and skinning, vertex by vertex in plain NumPy; and what a body file may get wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from snarfcli.bodies import builtin_body, load_body
+from snarfcli.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def body():
+    return builtin_body(torch.float64)
+
+
+def random_inputs(batch=2, seed=0):
+    rng = np.random.default_rng(seed)
+    return 0.5 * rng.normal(size=(batch, 24, 3)), rng.normal(size=10), rng.normal(size=(batch, 3))
+
+
+def reference_vertex(body, vertex, pose, betas, translation):
+    """SMPL's equations, written out for one vertex of one pose."""
+    shaped = body.v_template.numpy() + body.shapedirs.numpy() @ betas
+    joints = body.joint_regressor.numpy() @ shaped
+    rotations = [Rotation.from_rotvec(vector) for vector in pose]
+    feature = np.concatenate([(rotation.as_matrix() - np.eye(3)).ravel() for rotation in rotations[1:]])
+    point = shaped[vertex] + body.posedirs[vertex].numpy() @ feature
+    placed = []
+    for joint, parent in enumerate(body.parents):
+        if parent < 0:
+            placed.append((rotations[0], joints[0] + translation))
+        else:
+            turn, at = placed[parent]
+            placed.append((turn * rotations[joint], at + turn.apply(joints[joint] - joints[parent])))
+    weights = body.weights[vertex].numpy()
+    return sum(w * (turn.apply(point - rest) + at) for w, (turn, at), rest in zip(weights, placed, joints, strict=True))
+
+
+def test_pose_agrees_with_the_equations(body):
+    pose, betas, translation = random_inputs()
+    posed = body.pose(pose, betas, translation)
+    assert posed.vertices.shape == (2, 6890, 3)
+    for vertex in np.random.default_rng(1).choice(6890, 25, replace=False):
+        for frame in range(2):
+            expected = reference_vertex(body, vertex, pose[frame], betas, translation[frame])
+            np.testing.assert_allclose(posed.vertices[frame, vertex], expected, atol=1e-12)
+
+
+def test_rest_pose_is_the_shaped_template(body):
+    _, betas, _ = random_inputs()
+    v_shaped, joints = body.shaped(betas)
+    posed = body.pose(torch.zeros(1, 24, 3), betas)
+    torch.testing.assert_close(posed.vertices[0], v_shaped)
+    torch.testing.assert_close(posed.joints[0], joints)
+    torch.testing.assert_close(body.skeleton(betas).joints_rest, joints)
+    short, padded = body.shaped(betas[:3])[0], body.shaped(np.append(betas[:3], np.zeros(7)))[0]
+    torch.testing.assert_close(short, padded)
+
+
+def test_global_turn_is_rigid(body):
+    pose, betas, _ = random_inputs()
+    pose[1] = pose[0]
+    pose[0, 0], pose[1, 0] = 0, [0.3, -1.2, 0.5]
+    posed = body.pose(pose, betas)
+    root = body.shaped(betas)[1][0].numpy()
+    turned = Rotation.from_rotvec(pose[1, 0]).apply(posed.vertices[0].numpy() - root) + root
+    # the weights are stored in float32, so their rows sum to 1 within 1e-7
+    np.testing.assert_allclose(posed.vertices[1], turned, rtol=0, atol=1e-7)
+
+
+def test_float32_stays_close(body):
+    pose, betas, translation = random_inputs()
+    single = builtin_body().pose(pose, betas, translation).vertices
+    assert single.dtype == torch.float32
+    # metres; 24 transforms of size 1 chained nine deep, measured worst 6e-7
+    torch.testing.assert_close(single.double(), body.pose(pose, betas, translation).vertices, atol=3e-6, rtol=0)
+
+
+def test_gradients_reach_pose_and_shape(body):
+    pose = torch.zeros(1, 24, 3, dtype=torch.float64, requires_grad=True)
+    betas = torch.zeros(10, dtype=torch.float64, requires_grad=True)
+    weight = torch.randn(6890, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    loss = lambda p, b: (body.pose(p, b).vertices * weight).sum()  # noqa: E731
+    loss(pose, betas).backward()
+    for tensor, index in ((pose, (0, 18, 1)), (pose, (0, 0, 2)), (betas, (0,))):
+        step = torch.zeros_like(tensor)
+        step[index] = 1e-6
+        with torch.no_grad():
+            ends = [loss(pose + sign * step, betas) if tensor is pose else loss(pose, betas + sign * step) for sign in (1, -1)]
+        assert tensor.grad[index].item() == pytest.approx((ends[0] - ends[1]).item() / 2e-6, rel=1e-5)
+
+
+def test_builtin_body_is_sound(body):
+    edges = torch.cat([body.faces[:, [0, 1]], body.faces[:, [1, 2]], body.faces[:, [2, 0]]]).tolist()
+    directed = {tuple(edge) for edge in edges}
+    assert len(directed) == len(edges) and all((b, a) in directed for a, b in directed)  # closed, consistently wound
+    triangles = body.v_template[body.faces]
+    assert torch.linalg.det(triangles).sum() / 6 > 0.05  # volume in cubic metres: outward
+    torch.testing.assert_close(body.weights.sum(1), torch.ones(6890, dtype=torch.float64), atol=1e-6, rtol=0)
+    assert body.num_joints == 24 and body.num_betas == 10
+    height = np.ptp(body.v_template[:, 1].numpy())
+    assert 1.5 < height < 1.9
+    assert body.joint_names[4] == "l_knee" and body.shaped()[1][4, 0] > 0
+    assert body.to(torch.float32).v_template.dtype == torch.float32
+    assert body.to(torch.float32).faces.dtype == torch.int64
+
+
+def test_wrong_arguments(body):
+    with pytest.raises(ValueError, match=r"betas: wanted at most 10 values \[S\], got shape \[11\]"):
+        body.shaped(torch.zeros(11))
+    with pytest.raises(ValueError, match=r"pose: wanted shape \[B, 24, 3\], got \[1, 72\]"):
+        body.pose(torch.zeros(1, 72))
+
+
+def tiny_body():
+    """Two bones along y, an octahedron around them."""
+    vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float32)
+    faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    upper = np.float32(vertices[:, 1] > 0)
+    return {
+        "v_template": vertices,
+        "f": np.array(faces, np.uint32),
+        "weights": np.stack([1 - upper, upper], 1),
+        "J_regressor": np.full((2, 6), 1 / 6, np.float32),
+        "kintree_table": np.array([[2**32 - 1, 0], [0, 1]], np.uint32),
+        "shapedirs": np.zeros((6, 3, 2), np.float32),
+        "posedirs": np.zeros((6, 3, 9), np.float32),
+    }
+
+
+def test_reads_smpl_style_files(tmp_path):
+    np.savez(tmp_path / "body.npz", **tiny_body())
+    body = load_body(tmp_path / "body.npz", dtype=torch.float64)
+    assert body.parents == (-1, 0) and body.joint_names == ("joint_0", "joint_1")
+    bent = body.pose(torch.tensor([[[0.0, 0, 0], [0, 0, np.pi / 2]]])).vertices[0]
+    torch.testing.assert_close(bent[2], torch.tensor([-1.0, 0, 0], dtype=torch.float64))  # +y turns to -x
+    torch.testing.assert_close(bent[3], torch.tensor([0.0, -1, 0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"posedirs": None}, "lacks posedirs"),
+        ({"weights": np.zeros((5, 2), np.float32)}, r"weights has shape \[5, 2\], wanted \[6, 2\]"),
+        ({"posedirs": np.zeros((6, 3, 10), np.float32)}, r"posedirs has shape \[6, 3, 10\], wanted \[6, 3, 9\]"),
+        ({"v_template": np.full((6, 3), np.nan)}, "v_template must hold finite numbers"),
+        ({"weights": np.array("x")}, "weights must hold finite numbers"),
+        ({"f": np.full((8, 3), 6)}, "vertex numbers from 0 to 5"),
+        ({"kintree_table": np.array([[1, -1], [0, 1]])}, "root first"),
+        ({"v_template": np.float32(1)}, "v_template has shape"),
+    ],
+)
+def test_broken_files(tmp_path, change, message):
+    arrays = {key: value for key, value in {**tiny_body(), **change}.items() if value is not None}
+    np.savez(tmp_path / "body.npz", **arrays)
+    with pytest.raises(UserError, match=message) as caught:
+        load_body(tmp_path / "body.npz")
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_foreign_files(tmp_path):
+    with pytest.raises(UserError, match="no body at"):
+        load_body(tmp_path / "none.npz")
+    (tmp_path / "model.pkl").write_bytes(b"x")
+    with pytest.raises(UserError, match="is a pickle, which is not read"):
+        load_body(tmp_path / "model.pkl")

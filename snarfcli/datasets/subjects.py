@@ -100,9 +100,8 @@ def builtin_subject(subject: str | int) -> SubjectData:
     """
     subject = str(subject)
     if subject not in HELD_OUT_SEQUENCES:
-        raise UserError(
-            f"no built-in subject '{subject}'{nearest(subject, BUILTIN_SUBJECTS) or '.'} Known are {', '.join(BUILTIN_SUBJECTS)}"
-        )
+        hint = nearest(subject, BUILTIN_SUBJECTS) or "."
+        raise UserError(f"no built-in subject '{subject}'{hint} Known are {', '.join(BUILTIN_SUBJECTS)}")
     body = builtin_body()
     betas = _betas(subject, body.num_betas)
     held_out = HELD_OUT_SEQUENCES[subject]

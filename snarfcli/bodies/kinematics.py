@@ -117,9 +117,7 @@ def forward_kinematics(
         raise ValueError(f"pose: wanted shape [B, {joints}, 3], got {list(pose.shape)}")
     batch = pose.shape[0]
     if joints_rest.shape not in ((joints, 3), (batch, joints, 3)):
-        raise ValueError(
-            f"joints_rest: wanted shape [{joints}, 3] or [{batch}, {joints}, 3], got {list(joints_rest.shape)}"
-        )
+        raise ValueError(f"joints_rest: wanted shape [{joints}, 3] or [{batch}, {joints}, 3], got {list(joints_rest.shape)}")
     if translation is not None and translation.shape != (batch, 3):
         raise ValueError(f"translation: wanted shape [{batch}, 3], got {list(translation.shape)}")
     if any(not -1 <= parent < joint for joint, parent in enumerate(parents)) or parents[0] != -1:

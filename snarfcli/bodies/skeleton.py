@@ -97,9 +97,7 @@ class Skeleton:
 
     def to(self, *args: Any, **kwargs: Any) -> Skeleton:
         """Move both tensors as `Tensor.to` does."""
-        return Skeleton(
-            self.names, self.parents, self.joints_rest.to(*args, **kwargs), self.canonical_pose.to(*args, **kwargs)
-        )
+        return Skeleton(self.names, self.parents, self.joints_rest.to(*args, **kwargs), self.canonical_pose.to(*args, **kwargs))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and tensors, which `torch.load(weights_only=True)` reads back."""

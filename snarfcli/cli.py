@@ -193,7 +193,9 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
 
 def _quote(value: str) -> str:
     """Return a value that Hydra's grammar reads back unchanged, whatever characters a file name has."""
-    return "'" + re.sub(r"(\\*)'", lambda m: m.group(1) * 2 + "\\'", value) + "'"
+    # Within quotes only a quote is special, and so are the backslashes that lead up to one.
+    escaped = re.sub(r"(\\*)('|$)", lambda match: match.group(1) * 2 + ("\\'" if match.group(2) else ""), value)
+    return f"'{escaped}'"
 
 
 def _register(name: str, schema: type) -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from skinning_scenes import posed_queries, random_transforms, smooth_weights, unit_grid
 
 from snarfcli.deformer import find_correspondences
-from tests.deformer.scenes import random_transforms, smooth_weights, unit_grid
-from tests.deformer.test_search import posed_queries
 
 SHAPE = (3, 4, 5)
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.interpolate import RegularGridInterpolator
+from skinning_scenes import unit_grid
 
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.grid import cell_corners, locate, trilinear_gradients, trilinear_weights
 from snarfcli.deformer.skinning import interpolate
-from tests.deformer.scenes import unit_grid
 
 SHAPE = (3, 4, 6)
 

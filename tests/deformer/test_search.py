@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from skinning_scenes import exhaustive_roots, move, posed_queries, random_transforms, smooth_weights, unit_grid
 
 from snarfcli.deformer import find_correspondences
-from tests.deformer.scenes import exhaustive_roots, move, random_transforms, smooth_weights, unit_grid
 
 SHAPE = (6, 7, 8)
-
-
-def posed_queries(weights, transforms, count, seed=0):
-    """Return queries [N, 3] that have a root: random canonical points, moved."""
-    grid = unit_grid(weights.dtype)
-    generator = torch.Generator().manual_seed(seed)
-    share = torch.rand(count, 3, generator=generator, dtype=torch.float64).to(weights.dtype)
-    canonical = grid.lower + share * (grid.upper - grid.lower)
-    return move(canonical, weights, transforms, grid), canonical
 
 
 def same_roots(found, truth):

@@ -55,6 +55,15 @@ def move(canonical: Tensor, weights: Tensor, transforms: Tensor, grid: Canonical
     return out
 
 
+def posed_queries(weights: Tensor, transforms: Tensor, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Return queries [N, 3] that have a root under one pose [J, 4, 4], and the canonical points they were made from."""
+    grid = unit_grid(weights.dtype)
+    generator = torch.Generator().manual_seed(seed)
+    share = torch.rand(count, 3, generator=generator, dtype=torch.float64).to(weights.dtype)
+    canonical = grid.lower + share * (grid.upper - grid.lower)
+    return move(canonical, weights, transforms, grid), canonical
+
+
 def exhaustive_roots(points: Tensor, weights: Tensor, transforms: Tensor, grid: CanonicalGrid, levels: int = 4):
     """Find all roots of one pose in float64: cut cells into eight, `levels` times, while their posed box holds the query.
 

@@ -1,0 +1,46 @@
+# Each target sets up what it needs: in the active virtual environment, or in .venv where none is active.
+# Another Python: make PYTHON=python3.12 test
+SHELL := /bin/sh
+PYTHON ?= python3
+VENV := $(or $(VIRTUAL_ENV),.venv)
+INSTALLED := $(VENV)/.snarf-installed
+SNARF := $(VENV)/bin/snarf
+SUBJECT ?= 50002
+
+.PHONY: help setup demo test lint bench clean
+
+help:
+	@echo "make setup   install snarf into $(VENV)"
+	@echo "make demo    the whole job on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
+	@echo "make test    run the tests"
+	@echo "make lint    check the style of the code"
+	@echo "make bench   measure a training step, evaluation and mesh extraction"
+	@echo "make clean   remove $(VENV), samples and results"
+
+setup: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml tools/set_up.sh
+	PYTHON=$(PYTHON) tools/set_up.sh $(VENV)
+
+demo: $(INSTALLED)
+	$(SNARF) preprocess subject=$(SUBJECT)
+	$(SNARF) train subject=$(SUBJECT) training=quick run=demo resume=true
+	$(SNARF) animate subject=$(SUBJECT) run=demo resolution=128 max_frames=30
+	$(SNARF) eval subject=$(SUBJECT) run=demo
+	$(SNARF) eval --ood subject=$(SUBJECT) run=demo
+	@echo "avatar, tables and pictures: outputs/builtin/$(SUBJECT)/demo"
+	@echo "meshes and video:            outputs/builtin/$(SUBJECT)/demo/animation"
+
+test: $(INSTALLED)
+	$(VENV)/bin/python -m pytest -q -n auto
+
+lint: $(INSTALLED)
+	$(VENV)/bin/ruff check .
+
+bench: $(INSTALLED)
+	$(VENV)/bin/python benchmarks/bm_training.py
+	$(VENV)/bin/python benchmarks/bm_evaluation.py
+	$(VENV)/bin/python benchmarks/bm_extraction.py
+
+clean:
+	rm -rf .venv data/processed outputs

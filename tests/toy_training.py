@@ -1,0 +1,60 @@
+"""Small settings and samples for tests that train: the bending capsule of `toy_subject`, a grid and networks of its size."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+from toy_subject import toy_subject
+
+from snarfcli.datasets.preprocessing import preprocess_subject
+from snarfcli.datasets.store import SampleStore
+from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
+from snarfcli.models.avatar import Avatar
+from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
+from snarfcli.sampling import SamplingSettings
+from snarfcli.shape import ShapeConfig
+from snarfcli.training.extent import rough_canonical_surface
+from snarfcli.training.settings import TrainingConfig
+
+
+def toy_store(root: Path, points: int = 800, frames: int = 34) -> SampleStore:
+    """Make and open the samples of the toy subject under `root`."""
+    logging.getLogger("snarfcli").setLevel(logging.WARNING)
+    sampling = SamplingSettings(
+        points_per_frame=points, surface_noise_m=0.01, padding=0.1, inside_test="winding", seed=0
+    )
+    preprocess_subject(toy_subject(train_frames=frames), root, sampling, {"train": 1, "test": 1, "ood": 1})
+    return SampleStore.open(root, "builtin", "toy")
+
+
+def avatar_config(**search: object) -> AvatarConfig:
+    """Return networks of a size that trains in seconds."""
+    skinning = SkinningConfig(
+        resolution=[16, 12, 8], margin_m=[0.05, 0.05, 0.05], width=32, depth=2, weight_norm=False
+    )
+    shape = ShapeConfig(
+        width=32, depth=3, activation="relu", skip_layers=[], frequencies=[4.0], condition_layer=2, condition_size=4,
+        condition_at_start=False, geometric_init=False, weight_norm=False, prior_radius_m=0.07,
+    )  # fmt: skip
+    return AvatarConfig(ModelConfig(), skinning, SearchConfig(**search), shape)
+
+
+def training_config(**changes: object) -> TrainingConfig:
+    """Return settings of a short training."""
+    config = TrainingConfig(
+        name="toy", steps=150, poses_per_step=3, uniform_points=200, surface_points=200, learning_rate=5e-3,
+        final_learning_rate=0.05, warmup_steps=5, average_decay=0.95, bootstrap_steps=50, bone_occupancy_weight=0.1,
+        bone_points=5, joint_weight=1.0, joint_target="halves", precision="highest", autocast=False, validate_every=75,
+        validation_frames=2, checkpoint_every=50,
+    )  # fmt: skip
+    return replace(config, **changes)
+
+
+def new_avatar(store: SampleStore, config: AvatarConfig | None = None) -> Avatar:
+    """Return an untrained avatar of the store's subject."""
+    config = config or avatar_config()
+    surface = rough_canonical_surface(store)
+    grid = CanonicalGrid.around(surface, config.skinning.margin_m)
+    return Avatar(config, store.skeleton, grid, surface, {"data": "builtin", "subject": "toy"})

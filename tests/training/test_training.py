@@ -1,0 +1,166 @@
+"""Training on a bending capsule: it learns, it resumes exactly, it can be interrupted."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+import torch
+from toy_training import avatar_config, new_avatar, toy_store, training_config
+
+from snarfcli.errors import UserError
+from snarfcli.models.avatar import Avatar, load_checkpoint
+from snarfcli.models.extent import unpose_by_nearest_bone
+from snarfcli.training.loop import train
+from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Trainer
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return toy_store(tmp_path_factory.mktemp("toy"))
+
+
+def trainer_for(store, **changes):
+    torch.manual_seed(0)
+    return Trainer(new_avatar(store), store, training_config(**changes), 0, CPU)
+
+
+def test_learns_shape_and_weights(store, tmp_path):
+    trainer = trainer_for(store)
+    scalars = []
+    result = train(trainer, tmp_path, on_scalars=lambda step, numbers: scalars.append((step, numbers)))
+    assert result["validation"]["iou_bbox"] > 0.9  # a straight capsule scores 0.7 on these frames
+    assert result["inside_without_correspondence"] < 0.01
+    assert result["points_per_second"] > 0
+    assert scalars[-1][0] == 150
+    avatar = trainer.averaged_avatar()
+    ends = torch.tensor([[0.1, 0.0, 0.0], [0.9, 0.0, 0.0]])
+    weights = avatar.skinning_weights(ends)
+    assert weights[0, 0] > 0.9 and weights[1, 1] > 0.9  # learned without supervision beyond the joints
+    test = store.sequences("ood")[0]
+    pose = torch.as_tensor(test.poses[:1])
+    transforms = torch.as_tensor(test.bone_transforms[:1])
+    inside = avatar.query(torch.as_tensor(test.points(0))[None], transforms, pose).logits[0] > 0
+    truth = torch.as_tensor(test.occupancies(0))
+    assert float((inside & truth).sum() / (inside | truth).sum()) > 0.8
+
+
+def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path):
+    whole = trainer_for(store, steps=12)
+    for _ in range(12):
+        whole.advance()
+    first = trainer_for(store, steps=12)
+    for _ in range(7):
+        first.advance()
+    torch.save(first.state(), tmp_path / "checkpoint.pt")
+    torch.manual_seed(99)
+    second = Trainer(new_avatar(store), store, training_config(steps=12), 0, CPU)
+    second.restore(load_checkpoint(tmp_path / "checkpoint.pt", CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint"), "here")
+    assert second.step == 7
+    for _ in range(5):
+        second.advance()
+    for mine, theirs in zip(second.parameters + second.average, whole.parameters + whole.average, strict=True):
+        assert torch.equal(mine, theirs)
+
+
+def test_other_settings_cannot_be_resumed(store):
+    state = trainer_for(store).state()
+    other = trainer_for(store, learning_rate=1e-4)
+    with pytest.raises(UserError, match=r"training.learning_rate: 0.005 there, 0.0001 here"):
+        other.restore(state, "checkpoint.pt")
+
+
+def test_interrupt_ends_the_step_and_leaves_a_checkpoint(store, tmp_path):
+    trainer = trainer_for(store)
+    advance = trainer.advance
+
+    def interrupted_advance():
+        if trainer.step == 4:
+            signal.raise_signal(signal.SIGINT)
+        return advance()
+
+    trainer.advance = interrupted_advance
+    with pytest.raises(KeyboardInterrupt):
+        train(trainer, tmp_path, on_scalars=lambda step, numbers: None)
+    state = load_checkpoint(tmp_path / "checkpoint.pt", CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
+    assert state["step"] == 5
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
+    again = trainer_for(store)
+    again.restore(state, "checkpoint.pt")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_learning_rate_warms_up_and_falls(store):
+    trainer = trainer_for(store, warmup_steps=10, steps=100)
+    rates = []
+    for step in range(101):
+        trainer.step = step
+        rates.append(trainer.learning_rate())
+    assert rates[0] == pytest.approx(5e-4, rel=1e-2)
+    assert max(rates) == rates[9]
+    assert rates[100] == pytest.approx(0.05 * 5e-3)
+    assert all(a >= b for a, b in zip(rates[9:], rates[10:], strict=False))
+
+
+def test_gradient_of_the_whole_model(store):
+    """Posed occupancy loss to skinning and shape parameters in float64, against central differences."""
+    torch.manual_seed(0)
+    config = avatar_config(tolerance=1e-12, max_steps=30)
+    config.shape.activation = "softplus"
+    avatar = new_avatar(store, config)
+    model = avatar.model.double().train()
+    sequence = store.sequences("train")[0]
+    points = torch.as_tensor(sequence.points(9)[400:460])[None].double()
+    transforms = torch.as_tensor(sequence.bone_transforms[9:10]).double()
+    pose = torch.as_tensor(sequence.poses[9:10]).double()
+    goal = torch.randn(1, 60, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def loss():
+        return (model(points, transforms, pose).logits.sigmoid() * goal).sum()
+
+    parameters = list(model.parameters())
+    gradients = torch.autograd.grad(loss(), parameters, allow_unused=True)
+    generator = torch.Generator().manual_seed(2)
+    checked = 0
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        direction = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+        step = 1e-6
+        with torch.no_grad():
+            parameter += step * direction
+            ahead = loss()
+            parameter -= 2 * step * direction
+            behind = loss()
+            parameter += step * direction
+        numeric = float(ahead - behind) / (2 * step)
+        analytic = 0.0 if gradient is None else float((gradient * direction).sum())
+        assert analytic == pytest.approx(numeric, rel=2e-4, abs=1e-7)
+        checked += abs(numeric) > 1e-6
+    assert checked >= len(parameters) - 2
+
+
+def test_unposing_by_the_nearest_bone_straightens_the_capsule(store):
+    sequence = store.sequences("train")[0]
+    bent = max(range(sequence.num_frames), key=lambda f: abs(sequence.poses[f, 1, 2]))
+    vertices = torch.as_tensor(sequence.vertices(bent))
+    canonical = torch.as_tensor(store.canonical_vertices)
+    unposed = unpose_by_nearest_bone(vertices, torch.as_tensor(sequence.bone_transforms[bent]), store.skeleton)
+    assert (vertices - canonical).norm(dim=1).max() > 0.3
+    assert (unposed - canonical).norm(dim=1).max() < 0.12  # near the bend the nearest bone is not the right one
+    assert (unposed - canonical).norm(dim=1).median() < 0.01
+
+
+def test_avatar_file_holds_all_that_is_needed(store, tmp_path):
+    trainer = trainer_for(store, steps=3)
+    trainer.advance()
+    avatar = trainer.averaged_avatar()
+    avatar.save(tmp_path / "avatar.pt")
+    again = Avatar.load(tmp_path / "avatar.pt")
+    points = torch.rand(1, 200, 3, generator=torch.Generator().manual_seed(0))
+    pose = torch.tensor([[[0.0, 0.0, 0.3], [0.0, 0.0, 0.7]]])
+    assert torch.equal(avatar.occupancy(points, pose), again.occupancy(points, pose))
+    assert again.facts == avatar.facts
+    assert torch.equal(again.model.deformer.active_cells, avatar.model.deformer.active_cells)
+    with pytest.raises(ValueError, match=r"pose must have shape \[B, 2, 3\], got \[1, 3, 3\]"):
+        again.occupancy(points, torch.zeros(1, 3, 3))

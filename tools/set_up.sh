@@ -1,0 +1,27 @@
+#!/bin/sh
+# Make the virtual environment $1 (with $PYTHON) and install snarf into it, with what its tests need.
+# A PyTorch that is there already stays as it is. Where there is none, a machine with an NVIDIA driver gets the default
+# build, and any other one the CPU build, which spares it gigabytes of CUDA.
+set -eu
+venv=$1
+python=${PYTHON:-python3}
+"$python" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2])' || {
+    echo "snarf needs Python 3.10 or newer; $python is $("$python" --version 2>&1). Give another one: make PYTHON=python3.12" >&2
+    exit 2
+}
+[ -x "$venv/bin/python" ] || "$python" -m venv "$venv" || {
+    echo "could not make a virtual environment; on Debian and Ubuntu: apt install python3-venv" >&2
+    exit 2
+}
+pip="$venv/bin/python -m pip --disable-pip-version-check"
+if ! "$venv/bin/python" -c 'import torch' 2>/dev/null; then
+    if [ "$(uname -s)" = Linux ] && ! command -v nvidia-smi >/dev/null 2>&1; then
+        # First from wherever pip is set up to look, then from PyTorch's own index of CPU builds.
+        $pip install --quiet 'torch==2.13.0+cpu' 2>/dev/null ||
+            $pip install --quiet 'torch==2.13.0' --index-url https://download.pytorch.org/whl/cpu
+    else
+        $pip install --quiet 'torch>=2.4'
+    fi
+fi
+$pip install --quiet --editable '.[test]'
+touch "$venv/.snarf-installed"

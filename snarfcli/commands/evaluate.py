@@ -113,6 +113,7 @@ def run(config: EvalConfig) -> None:
         device=str(device),
         training=avatar.facts,
         search=asdict(search),
+        samples=store.manifest["settings"],
     )
     log.info("\n%s\n\n%s", table(evaluation), timings_text(evaluation))
     (folder / "frames.png").unlink(missing_ok=True)  # an older figure would not belong to these numbers
@@ -129,6 +130,7 @@ def run(config: EvalConfig) -> None:
             frames,
             count=config.figure_frames,
             resolution=config.figure_resolution,
+            title=evaluation.title,
         )
         log.info("figure: %s", folder / "frames.png")
 
@@ -147,6 +149,8 @@ def _check(config: EvalConfig) -> None:
     if config.search is not None and config.search.name not in _SEARCHES:
         name = config.search.name
         raise UserError(f"search.name must be {' or '.join(_SEARCHES)}, got '{name}'{nearest(name, _SEARCHES)}")
+    if config.search is not None and config.search.name == "complete" and config.search.init_bones is not None:
+        raise UserError("search.init_bones is for search=broyden; the complete search has no start bones")
 
 
 def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None:

@@ -14,7 +14,7 @@ from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import FrameMetrics, in_box, iou
 from snarfcli.progress import progress
 
-__all__ = ["Field", "FieldValues", "Samples", "choose_frames", "choose_points", "evaluate", "measure_frame"]
+__all__ = ["Field", "FieldValues", "Samples", "choose_frames", "choose_points", "evaluate", "measure_frame", "predict_inside"]
 
 _POINTS_AT_ONCE = 100_000  # points in one query, which bounds the memory of the search; frames have 20,000 by default
 
@@ -42,6 +42,7 @@ class Samples(Protocol):
     num_points: int
     num_uniform: int
     poses: np.ndarray
+    translation: np.ndarray
     bone_transforms: np.ndarray
     frame_numbers: np.ndarray
 
@@ -50,6 +51,8 @@ class Samples(Protocol):
     def occupancies(self, frames: int, index: np.ndarray | None = None) -> np.ndarray: ...
 
     def box(self, frame: int) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def vertices(self, frame: int) -> np.ndarray: ...
 
 
 def choose_frames(sequences: Sequence[Samples], max_frames: int | None = None) -> list[tuple[Samples, int]]:
@@ -136,9 +139,7 @@ def measure_frame(avatar: Field, sequence: Samples, index: int, chosen: np.ndarr
     """
     points, occupied = sequence.points(index, chosen), sequence.occupancies(index, chosen)
     uniform = sequence.num_uniform if chosen is None else int(np.searchsorted(chosen, sequence.num_uniform))
-    transforms = torch.as_tensor(sequence.bone_transforms[index])[None]
-    pose = torch.as_tensor(sequence.poses[index])[None]
-    inside, found, search_s, shape_s, total_s = _query(avatar, torch.as_tensor(points), transforms, pose)
+    inside, found, search_s, shape_s, total_s = _query(avatar, sequence, index, points)
     in_tight_box = in_box(points[:uniform], *sequence.box(index))
     return FrameMetrics(
         sequence=sequence.name,
@@ -157,12 +158,25 @@ def measure_frame(avatar: Field, sequence: Samples, index: int, chosen: np.ndarr
     )
 
 
+def predict_inside(avatar: Field, sequence: Samples, index: int, points: np.ndarray) -> np.ndarray:
+    """Return which points [N, 3] of one frame the avatar predicts to be inside, bool [N]."""
+    transforms, pose = _posed(sequence, index)
+    parts = torch.as_tensor(points).split(_POINTS_AT_ONCE)
+    return np.concatenate([(avatar.query(part[None], transforms, pose).logits[0] > 0).cpu().numpy() for part in parts])
+
+
+def _posed(sequence: Samples, index: int) -> tuple[Tensor, Tensor]:
+    """Return the bone transforms [1, J, 4, 4] and the pose [1, J, 3] of one frame."""
+    return torch.as_tensor(sequence.bone_transforms[index])[None], torch.as_tensor(sequence.poses[index])[None]
+
+
 def _query(
-    avatar: Field, points: Tensor, transforms: Tensor, pose: Tensor
+    avatar: Field, sequence: Samples, index: int, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float, float, float]:
     """Return which points [N, 3] are inside and which have a correspondence, [N] bool, and the seconds it took."""
+    transforms, pose = _posed(sequence, index)
     inside, found, search_s, shape_s, total_s = [], [], 0.0, 0.0, 0.0
-    for part in points.split(_POINTS_AT_ONCE):
+    for part in torch.as_tensor(points).split(_POINTS_AT_ONCE):
         start = time.perf_counter()
         values = avatar.query(part[None], transforms, pose)
         on_gpu = values.logits.is_cuda

@@ -3,8 +3,8 @@
 Protocol (SNARF Sec. 4.1 and its released code): a frame's points are half uniform in a cube around the posed mesh, whose side
 is the longest side of the tight box times 1.1 (IoU bbox), and half near the surface (IoU surface). The IoU of each frame is
 computed on its own; what a paper's table states is the mean over all frames, so that a long sequence counts for more than
-a short one. The IoU of the tight box uses those uniform points that lie in the tight box of the posed mesh: it has no
-margin of easy points around the body, but still depends on the pose.
+a short one. The IoU of the tight box uses those uniform points that lie in the tight box of the posed mesh. Points that both
+call outside never count, so it differs from IoU bbox only by what the avatar adds outside that box, such as floating blobs.
 """
 
 from __future__ import annotations

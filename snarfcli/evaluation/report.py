@@ -56,6 +56,13 @@ class Evaluation:
     """Facts about the avatar's making."""
     search: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the correspondence search."""
+    samples: Mapping[str, Any] = field(default_factory=dict)
+    """Settings with which the samples were made."""
+
+    @property
+    def title(self) -> str:
+        """What was evaluated on what."""
+        return f"{self.model} of subject {self.subject}, data {self.data}, {SPLITS[self.split]} ({self.split})"
 
 
 def table(evaluation: Evaluation) -> str:
@@ -67,11 +74,7 @@ def table(evaluation: Evaluation) -> str:
     names = f"{'sequence':{width}}  frames  {'bbox':>6}  {'surface':>7}  {'tight':>6}  {'worst':>6}"
     names += f"    {'all':>8}  {'inside':>9}"
     rule = "-" * len(names)
-    title = (
-        f"{evaluation.model} of subject {evaluation.subject}, data {evaluation.data}, "
-        f"{SPLITS[evaluation.split]} ({evaluation.split})"
-    )
-    lines = [title, "", head.rstrip(), names, rule]
+    lines = [evaluation.title, "", head.rstrip(), names, rule]
     lines += [_row(name, summary, width) for name, summary in groups.items()]
     lines.append(rule)
     if len(groups) > 1:
@@ -98,7 +101,8 @@ def timings_text(evaluation: Evaluation) -> str:
     """Return two lines: the times for as many points as in the papers' table, and where and how long it ran."""
     times = _timings(evaluation)
     machine = evaluation.machine["machine"]
-    where = machine["gpu"] if times["device"] != "cpu" and "gpu" in machine else f"{machine['threads']} threads"
+    threads = f"{machine['threads']} thread" + ("" if machine["threads"] == 1 else "s")
+    where = machine["gpu"] if times["device"] != "cpu" and "gpu" in machine else threads
     return (
         f"time for {REFERENCE_POINTS:,} points: search {times['search_ms_per_200k']:.1f} ms, "
         f"shape {times['shape_ms_per_200k']:.1f} ms, total {times['total_ms_per_200k']:.1f} ms\n"
@@ -143,6 +147,7 @@ def metrics_content(evaluation: Evaluation, settings: Mapping[str, Any]) -> dict
         **evaluation.machine,
         "training": dict(evaluation.training),
         "search": dict(evaluation.search),
+        "samples": dict(evaluation.samples),
         "seed": settings.get("seed"),
         "settings": dict(settings),
     }

@@ -10,55 +10,41 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_subject import toy_subject
+from toy_training import avatar_config, new_avatar, toy_store
 
 from snarfcli.commands.evaluate import EvalConfig, run
-from snarfcli.datasets.preprocessing import preprocess_subject
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.store import SampleStore
-from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
+from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.evaluation import evaluate as module
 from snarfcli.models.avatar import Avatar
-from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
-from snarfcli.sampling import SamplingSettings
-from snarfcli.shape import ShapeConfig
-
-STEPS = {"train": 8, "test": 1, "ood": 1}
-
-
-def toy_avatar(skeleton, subject: str = "toy") -> Avatar:
-    """Return an untrained avatar: the capsule prior fills its one bone, and its second bone is missing."""
-    torch.manual_seed(0)
-    config = AvatarConfig(
-        ModelConfig(),
-        SkinningConfig(resolution=[12, 6, 6], width=8, depth=1),
-        SearchConfig(),
-        ShapeConfig(width=8, depth=2, skip_layers=[], condition_layer=None, geometric_init=False, prior_radius_m=0.1),
-    )
-    around = torch.tensor([[-0.1, -0.1, -0.1], [1.1, 0.1, 0.1]])
-    grid = CanonicalGrid.around(around, config.skinning.margin_m)
-    return Avatar(config, skeleton, grid, {"data": "builtin", "subject": subject, "steps": 0, "loss": float("nan")})
 
 
 @pytest.fixture(scope="module")
-def data_root(tmp_path_factory) -> Path:
-    """Processed samples of the toy."""
-    root = tmp_path_factory.mktemp("data")
-    preprocess_subject(toy_subject(), root, SamplingSettings(800, 0.01, 0.1, "winding", 0), STEPS)
-    return root
+def store(tmp_path_factory) -> SampleStore:
+    """Processed samples of the toy: 3 held-out frames and 2 out of distribution."""
+    return toy_store(tmp_path_factory.mktemp("data"), points=800, frames=4)
+
+
+def toy_avatar(store: SampleStore, subject: str = "toy") -> Avatar:
+    """Return an untrained avatar: the capsule prior fills its one bone, and the other half of the body is missing."""
+    torch.manual_seed(0)
+    avatar = new_avatar(store)
+    avatar.facts = {"data": "builtin", "subject": subject, "steps": 0, "loss": float("nan")}
+    return avatar
 
 
 @pytest.fixture
-def config(data_root: Path, tmp_path: Path) -> EvalConfig:
+def config(store: SampleStore, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> EvalConfig:
     """Settings that evaluate the toy avatar, which lies in its run folder."""
+    caplog.set_level(logging.INFO, "snarfcli")
     output_root = tmp_path / "outputs"
-    store = SampleStore.open(data_root, "builtin", "toy")
-    toy_avatar(store.skeleton).save(output_root / "builtin" / "toy" / "fast_snarf" / "avatar.pt")
+    toy_avatar(store).save(output_root / "builtin" / "toy" / "fast_snarf" / "avatar.pt")
     return EvalConfig(
         subject="toy",
-        data=DataConfig("builtin", 8, 1, 1),
-        data_root=str(data_root),
+        data=DataConfig("builtin", 1, 1, 1),
+        data_root=str(store.folder.parents[2]),
         output_root=str(output_root),
         run="fast_snarf",
         split="id",
@@ -84,10 +70,9 @@ def read(path: Path) -> dict:
     return json.loads((path / "metrics.json").read_text())
 
 
-def test_the_numbers_are_those_of_the_avatar_on_the_samples(config, data_root):
+def test_the_numbers_are_those_of_the_avatar_on_the_samples(config, store):
     run(config)
     metrics = read(folder_of(config) / "eval_id")
-    store = SampleStore.open(data_root, "builtin", "toy")
     (sequence,) = store.sequences("test")
     avatar = Avatar.load(folder_of(config) / "avatar.pt")
     wanted = []
@@ -113,6 +98,7 @@ def test_metrics_say_what_was_measured(config):
     assert metrics["search"]["name"] == "complete"
     assert metrics["training"] == {"data": "builtin", "subject": "toy", "steps": 0, "loss": None}
     assert metrics["settings"]["points"] is None
+    assert metrics["samples"]["points_per_frame"] == 800
     assert metrics["timings"]["points"] == 2400
     assert metrics["timings"]["total_s"] > 0
     assert {"snarf", "torch", "python"} <= set(metrics["versions"])
@@ -120,7 +106,6 @@ def test_metrics_say_what_was_measured(config):
 
 
 def test_out_of_distribution_goes_to_its_own_folder(config, caplog):
-    caplog.set_level(logging.INFO)
     run(replace(config, split="ood", points=100, max_frames=1))
     metrics = read(folder_of(config) / "eval_ood")
     assert (metrics["split"], metrics["frames"], metrics["points_per_frame"]) == ("ood", 1, 100)
@@ -139,9 +124,8 @@ def test_another_search_leaves_the_avatars_own_results(config):
     assert broyden["settings"]["search"]["name"] == "broyden"
 
 
-def test_results_go_beside_a_given_checkpoint(config, tmp_path, caplog):
-    store = SampleStore.open(config.data_root, "builtin", "toy")
-    toy_avatar(store.skeleton, subject="somebody").save(tmp_path / "elsewhere" / "mine.pt")
+def test_results_go_beside_a_given_checkpoint(config, store, tmp_path, caplog):
+    toy_avatar(store, subject="somebody").save(tmp_path / "elsewhere" / "mine.pt")
     run(replace(config, ckpt=str(tmp_path / "elsewhere" / "mine.pt")))
     assert read(tmp_path / "elsewhere" / "eval_id")["frames"] == 3
     assert not (folder_of(config) / "eval_id").exists()
@@ -165,8 +149,8 @@ def test_an_unknown_subject_is_named_with_the_nearest_one(config):
         run(replace(config, subject="50003"))
 
 
-def test_an_avatar_of_another_skeleton_is_refused(config):
-    skeleton = SampleStore.open(config.data_root, "builtin", "toy").skeleton
+def test_an_avatar_of_another_skeleton_is_refused(config, store):
+    skeleton = store.skeleton
     joints = torch.cat([skeleton.joints_rest, torch.tensor([[1.0, 0, 0]])])
     longer = replace(
         skeleton,
@@ -175,7 +159,7 @@ def test_an_avatar_of_another_skeleton_is_refused(config):
         joints_rest=joints,
         canonical_pose=torch.zeros(3, 3),
     )
-    toy_avatar(longer).save(folder_of(config) / "avatar.pt")
+    Avatar(avatar_config(), longer, toy_avatar(store).model.deformer.grid).save(folder_of(config) / "avatar.pt")
     with pytest.raises(UserError, match="the avatar has 3 joints and the samples of subject toy have 2"):
         run(config)
 
@@ -189,6 +173,7 @@ def test_an_avatar_of_another_skeleton_is_refused(config):
         ({"figure_resolution": 4}, "figure_resolution must be at least 16"),
         ({"search": SearchConfig(name="broiden")}, "search.name must be .* did you mean 'broyden'"),
         ({"search": SearchConfig(name="broyden", init_bones=[7])}, r"search.init_bones must lie in 0..1, got \[7\]"),
+        ({"search": SearchConfig(name="complete", init_bones=[0])}, "search.init_bones is for search=broyden"),
         ({"search": SearchConfig(name="broyden", init_bones=[])}, r"search.init_bones must lie in 0..1, got \[\]"),
     ],
 )
@@ -221,6 +206,29 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(config, tmp_pa
     monkeypatch.setattr("os.access", lambda path, mode: False)
     with pytest.raises(UserError, match="cannot write results to .*eval_id"):
         run(config)
+
+
+def test_the_figure_shows_worst_and_best_frames(config, caplog):
+    from PIL import Image
+
+    run(replace(config, figure=True))
+    picture = np.asarray(Image.open(folder_of(config) / "eval_id" / "frames.png"))
+    assert picture.shape[1] > picture.shape[0] > 320  # one row of six pictures
+    assert str(folder_of(config) / "eval_id" / "frames.png") in caplog.text
+    # figures of former numbers do not stay
+    run(replace(config, figure=False))
+    assert not (folder_of(config) / "eval_id" / "frames.png").exists()
+
+
+def test_an_avatar_without_any_surface_is_evaluated_and_drawn(config, store, caplog):
+    avatar = toy_avatar(store)
+    avatar.model.shape.bones += 50.0  # the prior, and with it the body, is far outside the grid
+    avatar.save(folder_of(config) / "avatar.pt")
+    run(replace(config, figure=True))
+    metrics = read(folder_of(config) / "eval_id")
+    assert (metrics["iou_bbox"], metrics["iou_surface"]) == (0.0, 0.0)
+    assert (folder_of(config) / "eval_id" / "frames.png").exists()
+    assert "nothing to draw for wave, frame" in caplog.text
 
 
 def test_the_yaml_fits_the_settings():

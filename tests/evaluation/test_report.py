@@ -30,6 +30,7 @@ EVALUATION = Evaluation(
     machine=MACHINE,
     training={"steps": 10, "validation": {"iou_bbox": torch.tensor(0.5)}},
     search={"name": "complete"},
+    samples={"points_per_frame": 1000},
 )
 SETTINGS = {"seed": 3, "split": "ood", "ckpt": None, "data": {"name": "builtin"}}
 
@@ -92,6 +93,7 @@ def test_metrics_file_has_what_a_reader_needs(tmp_path: Path):
     assert content["training"] == {"steps": 10, "validation": {"iou_bbox": 0.5}}
     assert content["settings"] == SETTINGS
     assert content["search"] == {"name": "complete"}
+    assert content["samples"] == {"points_per_frame": 1000}
     assert "mean over all frames" in content["protocol"]["averaging"]
 
 

@@ -1,0 +1,168 @@
+"""A picture of the worst and the best frames: ground truth, prediction and wrongly labelled points side by side."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from snarfcli.evaluation.evaluate import Samples, predict_inside
+from snarfcli.evaluation.metrics import FrameMetrics
+from snarfcli.progress import progress
+
+if TYPE_CHECKING:
+    from snarfcli.models.avatar import Avatar
+
+__all__ = ["EXTRA", "MISSING", "choose_extremes", "draw_frame", "write_figure"]
+
+log = logging.getLogger(__name__)
+
+MISSING = (214, 39, 40)
+"""Colour, sRGB, of points that are inside and were predicted to be outside."""
+EXTRA = (31, 87, 200)
+"""Colour, sRGB, of points that are outside and were predicted to be inside."""
+
+_PANEL = 320  # pixels
+_APART = 8  # a sequence is cut into so many stretches, and of each at most one frame is among the worst or the best
+_PALE = 225  # sRGB grey of the body under the points
+_COLUMNS = ("ground truth", "prediction", "red: missing points, blue: extra points")
+
+
+def choose_extremes(frames: Sequence[FrameMetrics], count: int) -> tuple[list[FrameMetrics], list[FrameMetrics]]:
+    """Return the `count` worst frames, worst first, and the best ones, best first, by surface IoU.
+
+    Neighbouring frames look alike, so of each eighth of a sequence at most one is taken among either. No frame is in
+    both lists; of few frames the worse half is the worst.
+    """
+    count = min(count, max(1, len(frames) // 2))
+    length = {name: 1 + max(f.frame for f in frames if f.sequence == name) for name in {f.sequence for f in frames}}
+    order = sorted(frames, key=lambda frame: (frame.iou_surface, frame.sequence, frame.frame))
+
+    def pick(candidates: Sequence[FrameMetrics]) -> list[FrameMetrics]:
+        chosen: dict[tuple[str, int], FrameMetrics] = {}
+        for frame in candidates:
+            stretch = (frame.sequence, frame.frame * _APART // length[frame.sequence])
+            chosen.setdefault(stretch, frame)
+        return list(chosen.values())[:count]
+
+    worst = pick(order)
+    best = pick([frame for frame in reversed(order) if frame not in worst])
+    return worst, best
+
+
+def write_figure(
+    path: str | Path,
+    avatar: Avatar,
+    faces: np.ndarray,
+    sequences: Sequence[Samples],
+    frames: Sequence[FrameMetrics],
+    *,
+    count: int = 3,
+    resolution: int = 128,
+    title: str = "",
+) -> None:
+    """Write a PNG, whole or not at all: the worst frames on the left, the best on the right, by surface IoU.
+
+    Args:
+        path: where to.
+        avatar: the avatar that was measured.
+        faces: [F, 3] of the ground truth.
+        sequences: samples; their names are those in `frames`.
+        frames: what was measured.
+        count: how many of either.
+        resolution: voxels along the longest side of the predicted meshes.
+        title: what the figure shows.
+    """
+    from snarfcli.export.sheet import contact_sheet, write_png
+
+    by_name = {sequence.name: sequence for sequence in sequences}
+    worst, best = choose_extremes(frames, count)
+    rows: list[list[np.ndarray | None]] = [[] for _ in worst]
+    captions: list[list[str | None]] = [[] for _ in worst]
+    chosen = [(row, frame) for group in (worst, best) for row, frame in enumerate(group)]
+    for row, frame in progress(chosen, desc="drawing", unit="frames"):
+        pictures, (missing, extra) = draw_frame(
+            avatar, faces, by_name[frame.sequence], frame.index, resolution=resolution
+        )
+        rows[row] += pictures
+        captions[row] += [
+            f"{frame.sequence}, frame {frame.frame}",
+            f"IoU surface {100 * frame.iou_surface:.1f} %, bbox {100 * frame.iou_bbox:.1f} %"
+            + ("" if pictures[1] is not None else " (no surface)"),
+            f"{missing} missing, {extra} extra of {by_name[frame.sequence].num_points}",
+        ]
+    width = len(_COLUMNS) * (2 if best else 1)
+    for row, caption in zip(rows, captions, strict=True):
+        row += [None] * (width - len(row))
+        caption += [None] * (width - len(caption))
+    sides = [f"worst: {_COLUMNS[0]}", *_COLUMNS[1:], *([f"best: {_COLUMNS[0]}", *_COLUMNS[1:]] if best else [])]
+    write_png(path, contact_sheet(rows, column_labels=sides, captions=captions, title=title or None))
+
+
+def draw_frame(
+    avatar: Avatar, faces: np.ndarray, sequence: Samples, index: int, *, resolution: int, size: int = _PANEL
+) -> tuple[list[np.ndarray | None], tuple[int, int]]:
+    """Draw one frame from one camera: ground truth, prediction, and the points whose label was predicted wrong.
+
+    Args:
+        avatar: the predicting avatar.
+        faces: [F, 3] of the ground truth.
+        sequence: samples.
+        index: frame.
+        resolution: voxels along the longest side of the predicted mesh.
+        size: pixels along each side of a picture.
+
+    Returns:
+        Three pictures [size, size, 3] uint8, sRGB, None for the prediction where the field has no surface; and the
+        numbers of missing and of extra points.
+    """
+    from snarfcli.export.camera import Camera
+    from snarfcli.export.render import render
+    from snarfcli.meshing.mesh import Mesh
+    from snarfcli.meshing.surfaces import field_surface
+
+    truth = Mesh(sequence.vertices(index), faces)
+    camera = Camera.framing(truth.vertices)
+    floor_y = float(truth.vertices[:, 1].min())
+    pose, translation = (torch.as_tensor(values[index]) for values in (sequence.poses, sequence.translation))
+    try:
+        predicted = field_surface(avatar, pose, translation, resolution)
+    except ValueError as error:
+        log.warning("warning: nothing to draw for %s, frame %d: %s", sequence.name, sequence.frame_numbers[index], error)
+        predicted = None
+    pale = replace(truth, colors=np.full(truth.vertices.shape, _PALE, np.uint8))
+    pictures = [
+        None if mesh is None else render(mesh, camera, size, floor_y=floor_y) for mesh in (truth, predicted, pale)
+    ]
+    points, occupied = sequence.points(index), sequence.occupancies(index)
+    inside = predict_inside(avatar, sequence, index, points)
+    missing, extra = occupied & ~inside, inside & ~occupied
+    for wrong, color in ((extra, EXTRA), (missing, MISSING)):
+        pictures[2] = _draw_points(pictures[2], camera.project(points[wrong], size, size), color)
+    return pictures, (int(missing.sum()), int(extra.sum()))
+
+
+def _draw_points(picture: np.ndarray, projected: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
+    """Draw discs over a picture, whether or not a surface hides them: most missing points lie below it.
+
+    Args:
+        picture: [H, W, 3] uint8.
+        projected: [N, 3] pixel coordinates and depth.
+        color: sRGB.
+    """
+    from PIL import Image, ImageDraw
+
+    scale = 4  # PIL does not smooth edges, a reduction does
+    height, width = picture.shape[:2]
+    mask = Image.new("L", (width * scale, height * scale))
+    draw = ImageDraw.Draw(mask)
+    radius = scale * max(0.9, height / 400)
+    for x, y in scale * projected[:, :2]:
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=255)
+    share = np.asarray(mask.resize((width, height), Image.Resampling.BOX), np.float32)[..., None] / 255
+    return np.rint(picture * (1 - share) + np.asarray(color, np.float32) * share).astype(np.uint8)

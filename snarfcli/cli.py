@@ -16,7 +16,7 @@ import snarfcli
 from snarfcli.errors import UserError, nearest
 from snarfcli.settings import check_overrides, config_folder, describe, group_options, group_schemas
 
-__all__ = ["COMMANDS", "Command", "main"]
+__all__ = ["COMMANDS", "Command", "main", "register_schemas"]
 
 log = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ def _run(command: Command, arguments: list[str]) -> int:
     module = importlib.import_module(f"snarfcli.commands.{command.module}")
     schema = getattr(module, command.schema)
     check_overrides([argument for argument in overrides if not argument.startswith("-") and "=" in argument], schema)
-    _register(command.name, schema)
+    register_schemas(command.name, schema)
     codes: list[int] = []
     errors: list[Exception] = []
 
@@ -198,7 +198,7 @@ def _quote(value: str) -> str:
     return f"'{escaped}'"
 
 
-def _register(name: str, schema: type) -> None:
+def register_schemas(name: str, schema: type) -> None:
     """Put the dataclass of a command, and those of its fields, into Hydra's store as `schema/...`."""
     from hydra.core.config_store import ConfigStore
 

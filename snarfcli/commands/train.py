@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import MISSING, OmegaConf
 
 from snarfcli.datasets.settings import DataConfig
@@ -25,7 +26,7 @@ from snarfcli.training.loop import train
 from snarfcli.training.settings import TrainingConfig
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Trainer
 
-__all__ = ["TrainConfig", "run"]
+__all__ = ["TrainConfig", "new_trainer", "run"]
 
 log = logging.getLogger(__name__)
 
@@ -84,12 +85,7 @@ def run(config: TrainConfig) -> None:
     frames = sum(len(sequence.train_frames) for sequence in sequences)
     log.info("data: %s, subject %s, %d sequences, %d frames to train on", store.data, store.subject, len(sequences), frames)
 
-    avatar_config = AvatarConfig(config.model, config.skinning, config.search, config.shape)
-    facts = {"data": config.data.name, "subject": config.subject, "seed": config.seed, "training": config.training.name}
-    surface = rough_canonical_surface(store)
-    grid = CanonicalGrid.around(surface, config.skinning.margin_m)
-    avatar = Avatar(avatar_config, store.skeleton, grid, surface, facts)
-    trainer = Trainer(avatar, store, config.training, config.seed, device)
+    trainer = new_trainer(config, store, device)
     if config.resume and checkpoint.exists():
         state = load_checkpoint(checkpoint, CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
         trainer.restore(state, str(checkpoint))
@@ -100,7 +96,7 @@ def run(config: TrainConfig) -> None:
     elif config.overwrite and folder.exists():
         shutil.rmtree(folder)
     _write_config(folder, config)
-    parameters = sum(p.numel() for p in avatar.model.parameters())
+    parameters = sum(p.numel() for p in trainer.parameters)
     log.info("run: %s, %s parameters, %d steps on %s", folder, f"{parameters:,}", config.training.steps, device)
 
     start = time.time()
@@ -122,6 +118,19 @@ def run(config: TrainConfig) -> None:
             100 * validation["iou_surface"],
         )
     log.info("avatar: %s", folder / "avatar.pt")
+
+
+def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -> Trainer:
+    """Return a fresh avatar of the store's subject in the hands of a trainer."""
+    surface = rough_canonical_surface(store)
+    avatar = Avatar(
+        AvatarConfig(config.model, config.skinning, config.search, config.shape),
+        store.skeleton,
+        CanonicalGrid.around(surface, config.skinning.margin_m),
+        surface,
+        {"data": store.data, "subject": store.subject, "seed": config.seed, "training": config.training.name},
+    )
+    return Trainer(avatar, store, config.training, config.seed, device)
 
 
 def _write_config(folder: Path, config: TrainConfig) -> None:

@@ -1,0 +1,69 @@
+"""What the benchmarks share: machine, timing with median and spread, and a table."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+from snarfcli.runs import machine_facts
+
+__all__ = ["arguments", "median_and_spread", "print_machine", "print_table", "timed"]
+
+
+def arguments(description: str, **extra: dict) -> argparse.Namespace:
+    """Read the options that all benchmarks have, and `extra` ones (name: keywords of `add_argument`)."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--threads", type=int, default=None, help="threads of PyTorch (default: its own choice)")
+    parser.add_argument("--repeats", type=int, default=5, help="timed repetitions; the median is reported")
+    for name, keywords in extra.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", **keywords)
+    options = parser.parse_args()
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    return options
+
+
+def require(path: Path, command: str) -> Path:
+    """Return `path`, or end with a line that says how to make it."""
+    if not path.exists():
+        raise SystemExit(f"no {path}; make it with: {command}")
+    return path
+
+
+def timed(work: Callable[[], object], repeats: int) -> list[float]:
+    """Return the seconds of `repeats` calls after a warm-up call."""
+    work()
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - start)
+    return seconds
+
+
+def median_and_spread(seconds: Sequence[float]) -> str:
+    """Return median, least and most in milliseconds."""
+    ms = [1000 * value for value in seconds]
+    return f"{statistics.median(ms):.1f} ({min(ms):.1f}-{max(ms):.1f})"
+
+
+def print_machine() -> None:
+    """Print the machine and the versions that the figures below belong to."""
+    facts = machine_facts()
+    machine, versions = facts["machine"], facts["versions"]
+    gpu = f", {machine['gpu']}" if "gpu" in machine else ""
+    print(f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads{gpu}")
+    print(", ".join(f"{name} {version}" for name, version in versions.items()))
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows of text as a Markdown table."""
+    widths = [max(len(str(row[i])) for row in [header, *rows]) for i in range(len(header))]
+    lines = [header, ["-" * width for width in widths], *rows]
+    for line in lines:
+        print("| " + " | ".join(str(cell).ljust(width) for cell, width in zip(line, widths, strict=True)) + " |")

@@ -76,6 +76,8 @@ class AnimateConfig:
     """field (the union, watertight) or skinned (the canonical mesh moved by its skin)."""
     resolution: int = MISSING
     """Voxels along the longest side: 128, 256, 512 or any number from 16."""
+    keep_share: float = MISSING
+    """Loose pieces with fewer faces than this share of the largest surface's are dropped."""
     meshes: bool = MISSING
     """Whether to write a mesh a frame."""
     format: str = MISSING
@@ -139,6 +141,7 @@ def run(config: AnimateConfig) -> int:
         suffix=config.format if config.meshes else None,
         weights_from=canonical,
         weight_colors=config.weight_colors,
+        keep_share=config.keep_share,
     )
     try:
         if config.video:
@@ -174,6 +177,8 @@ def _check(config: AnimateConfig) -> tuple[int, int]:
         value = getattr(config, name)
         if value is not None and value < least:
             raise UserError(f"{name} must be at least {least}, got {value}")
+    if not 0 <= config.keep_share <= 1:
+        raise UserError(f"keep_share must be between 0 and 1, got {config.keep_share}")
     if not config.motion_frame_rate > 0:
         raise UserError(f"motion_frame_rate must be positive, got {config.motion_frame_rate}")
     if not abs(config.elevation_deg) < 90:
@@ -226,6 +231,7 @@ def _settings(config: AnimateConfig, avatar: Path, motion: Motion, numbers: list
         "frames": [numbers[0], numbers[-1], config.step],
         "surface": config.surface,
         "resolution": config.resolution,
+        "keep_share": config.keep_share,
         "format": config.format,
         "weight_colors": config.weight_colors,
     }
@@ -240,9 +246,7 @@ def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
         if changed:
             what = ", ".join(f"{name} {old.get(name)} (now {settings[name]})" for name in changed if "sha256" not in name)
             what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
-            raise UserError(
-                f"{folder} holds frames made with {what}; give overwrite=true to replace them, or output=FOLDER"
-            )
+            raise UserError(f"{folder} holds frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
     else:
         for stale in [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), folder / _VIDEO]:
             stale.unlink(missing_ok=True)
@@ -291,6 +295,9 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
         log.info("meshes: %s", folder / f"frame_*.{config.format}")
     if config.video:
         log.info("video: %s", folder / _VIDEO)
+    pieces = sum(frame.components > 1 for frame in frames)
+    if pieces:
+        log.info("%d frames have loose pieces; keep_share=0.1 would drop all but large ones", pieces)
     if skipped:
         log.warning("%d of %d frames have no surface; see %s", skipped, len(frames), folder / _RECORD)
     return 1 if skipped else 0

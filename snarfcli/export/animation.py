@@ -68,6 +68,8 @@ class Animation:
     """Canonical mesh whose weights colour the meshes of the field, see `field_surface`."""
     weight_colors: bool = False
     """Whether vertices are coloured by their skinning weights."""
+    keep_share: float = 0.01
+    """Connected surfaces with fewer faces than this share of the largest one's are dropped."""
     frames: list[FrameRecord] = field(default_factory=list)
     """What has been done so far."""
 
@@ -110,6 +112,7 @@ class Animation:
                 self.resolution,
                 surface=self.surface,
                 weights_from=self.weights_from if self.weight_colors else None,
+                keep_share=self.keep_share,
             )
         except (EmptySurface, FullSurface) as error:
             frame.problem, frame.file = str(error), None

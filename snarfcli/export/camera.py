@@ -86,9 +86,7 @@ class Camera:
         depth = -local[:, 2]
         focal = height / 2 / math.tan(self.fov_rad / 2)
         safe = np.where(depth > 1e-9, depth, 1e-9)
-        return np.stack(
-            [width / 2 + focal * local[:, 0] / safe, height / 2 - focal * local[:, 1] / safe, depth], axis=1
-        )
+        return np.stack([width / 2 + focal * local[:, 0] / safe, height / 2 - focal * local[:, 1] / safe, depth], axis=1)
 
     def rays(self, x: np.ndarray, y: np.ndarray, width: int, height: int) -> np.ndarray:
         """Return unit directions [N, 3] float32 through pixel coordinates x, y [N]."""

@@ -171,9 +171,7 @@ def _floor_shadow(scene: LitScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     margin = 0.25 * tall
     lower, upper = corners.min(axis=0) - margin, corners.max(axis=0) + margin
     cell = (upper - lower) / _FLOOR_CELLS
-    index = np.stack(np.meshgrid(np.arange(_FLOOR_CELLS), np.arange(_FLOOR_CELLS), indexing="ij"), axis=-1).reshape(
-        -1, 2
-    )
+    index = np.stack(np.meshgrid(np.arange(_FLOOR_CELLS), np.arange(_FLOOR_CELLS), indexing="ij"), axis=-1).reshape(-1, 2)
     spots = lower + (index + 0.5) * cell
     points = np.stack([spots[:, 0], np.full(len(spots), scene.floor_y), spots[:, 1]], axis=1)
     normals = np.broadcast_to((0.0, 1.0, 0.0), points.shape)

@@ -65,9 +65,7 @@ def set_stage(
             lower, upper = (corner.cpu().numpy() for corner in avatar.posed_box(transforms))
             points.append(np.stack(np.meshgrid(*zip(lower, upper, strict=True)), axis=-1).reshape(-1, 3))
     seen = np.concatenate(points)
-    camera = Camera.framing(
-        seen, aspect=aspect, azimuth_rad=_heading_rad(poses) + azimuth_rad, elevation_rad=elevation_rad
-    )
+    camera = Camera.framing(seen, aspect=aspect, azimuth_rad=_heading_rad(poses) + azimuth_rad, elevation_rad=elevation_rad)
     return Stage(camera, float(seen[:, 1].min()))
 
 

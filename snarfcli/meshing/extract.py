@@ -17,18 +17,19 @@ import torch
 from torch import Tensor
 
 from snarfcli.meshing.lattice import Lattice, any_corner, grow, mixed_cells, nodes_of_cells
+from snarfcli.meshing.marching import MARGIN, Crossings, march
 from snarfcli.meshing.mesh import ExtractionStats, Mesh, keep_components
 
 __all__ = ["EmptySurface", "FullSurface", "extract_surface"]
 
-# Coarsest lattice, cells along the longest side: for a standing body 3 cm, a finger and a half.
-_COARSE = 64
+# First lattice, cells along the longest side: a quarter of the resolution, within these bounds. 64 are 3 cm on a standing body.
+# What is joined to something that the first lattice meets is followed however thin it is, so this matters for loose parts.
+_COARSE = (32, 64)
 # Cells around the mixed ones that are split as well, on all levels but the last.
 _DILATE = 1
-# Vertices keep this share of a voxel away from the lattice nodes: no edge shrinks to nothing, so no triangle degenerates
-# and the connectivity, which depends on the signs alone, stays as it is. At 256 voxels on 1.7 m: 7 micrometres.
-_MARGIN = 1e-3
-# Node layers marched at once: bounds the memory, not the result.
+# Steps in which a box that was too small is widened by up to half of its longest side, each way.
+_WIDENINGS = 8
+# Node layers looked at together: bounds the memory, not the result.
 _SLAB = 32
 
 
@@ -47,8 +48,10 @@ def extract_surface(
     resolution: int,
     *,
     level: float = 0.0,
-    coarse: int = _COARSE,
+    coarse: int | None = None,
     dilate: int = _DILATE,
+    widen: bool = False,
+    refine: int = 1,
     keep_share: float = 0.01,
     chunk: int = 65536,
 ) -> Mesh:
@@ -61,9 +64,13 @@ def extract_surface(
         upper: [3] opposite corner.
         resolution: cells along the longest side of the box; cells are cubes.
         level: value at the surface.
-        coarse: cells along the longest side of the first lattice, at least; features smaller than such a cell that
-            are not close to others can be missed.
+        coarse: cells along the longest side of the first lattice, at least; loose parts smaller than such a cell can be
+            missed. By default a quarter of `resolution`, within 32 and 64.
         dilate: cells around the surface that are split as well, on all levels but the last.
+        widen: where the field is occupied at the border of the box, move the border outwards until it is not, at most by
+            half the box. For boxes that are an estimate.
+        refine: evaluations at each vertex that move it along its lattice edge to where the field really crosses `level`.
+            Without one, a field that is not linear within a cell shows terraces.
         keep_share: connected surfaces with fewer faces than this share of the largest one's are dropped.
         chunk: points in one call of the field.
 
@@ -76,8 +83,10 @@ def extract_surface(
         ValueError: an argument is out of range, or the field returns NaN or a wrong shape.
     """
     start = time.perf_counter()
+    if coarse is None:
+        coarse = min(max(resolution // 4, _COARSE[0]), _COARSE[1])
     lattice = _first_lattice(lower, upper, resolution, coarse)
-    for name, value, least in (("chunk", chunk, 1), ("dilate", dilate, 0)):
+    for name, value, least in (("chunk", chunk, 1), ("dilate", dilate, 0), ("refine", refine, 0)):
         if value < least:
             raise ValueError(f"{name}: wanted at least {least}, got {value}")
     if not 0.0 <= keep_share <= 1.0:
@@ -87,17 +96,17 @@ def extract_surface(
     wanted = np.ones(lattice.shape, dtype=bool)
     values = np.empty(lattice.shape, dtype=np.float32)
     evaluator.fill(lattice, values, wanted)
-    known = wanted
     inside = values > 0
     if not inside.any():
-        raise EmptySurface(
-            f"the field is unoccupied at all {inside.size} points of the first lattice, so there is no surface"
-        )
+        raise EmptySurface(f"the field is unoccupied at all {inside.size} points of the first lattice, so there is no surface")
     if inside.all():
         raise FullSurface(
             f"the field is occupied at all {inside.size} points of the first lattice, so it has no surface in the box"
         )
+    if widen:
+        lattice, values = _widen(evaluator, lattice, values)
     capped = _close_border(values)
+    known = np.ones(lattice.shape, dtype=bool)
 
     while lattice.stride > 1:
         capped |= _complete(evaluator, lattice, values, known)
@@ -113,8 +122,10 @@ def extract_surface(
     capped |= _complete(evaluator, lattice, values, known)
     del known, wanted
 
-    vertices_l, faces = _march(values)
-    vertices = (lattice.origin + vertices_l * lattice.spacing).astype(np.float32)
+    crossings = march(values)
+    del values
+    vertices = _place(evaluator, lattice, crossings, refine)
+    faces = crossings.faces
     vertices, faces, found, kept = keep_components(vertices, faces, keep_share)
     stats = ExtractionStats(
         points=evaluator.points,
@@ -149,6 +160,21 @@ def _first_lattice(lower: Tensor | np.ndarray, upper: Tensor | np.ndarray, resol
     cells = np.ceil(size / (spacing * stride) - 1e-6).astype(int) + 2
     origin = (corners[0] + corners[1] - cells * spacing * stride) / 2
     return Lattice(origin=origin, spacing=spacing, stride=stride, shape=tuple(int(n) + 1 for n in cells))
+
+
+def _widen(evaluator: _Evaluator, lattice: Lattice, values: np.ndarray) -> tuple[Lattice, np.ndarray]:
+    """Add cells to the first lattice on the sides where it is occupied, and evaluate them."""
+    step = max(1, max(lattice.shape) // (2 * _WIDENINGS))
+    for _ in range(_WIDENINGS):
+        pads = [tuple(step * bool((values.take(end, axis) > 0).any()) for end in (0, -1)) for axis in range(3)]
+        if not np.any(pads):
+            break
+        wanted = np.pad(np.zeros(lattice.shape, dtype=bool), pads, constant_values=True)
+        values = np.pad(values, pads)
+        origin = lattice.origin - np.array([before for before, _ in pads]) * lattice.spacing * lattice.stride
+        lattice = Lattice(origin, lattice.spacing, lattice.stride, wanted.shape)
+        evaluator.fill(lattice, values, wanted)
+    return lattice, values
 
 
 def _split(lattice: Lattice, values: np.ndarray, known: np.ndarray) -> tuple[Lattice, np.ndarray, np.ndarray]:
@@ -211,6 +237,23 @@ def _close_border(values: np.ndarray) -> bool:
     return capped
 
 
+def _place(evaluator: _Evaluator, lattice: Lattice, crossings: Crossings, refine: int) -> np.ndarray:
+    """Return the vertices [V, 3] float32: where the field crosses zero on its lattice edges, by false position."""
+    low, high = np.zeros(len(crossings.axis)), np.ones(len(crossings.axis))
+    value_low, value_high = crossings.value_a.copy(), crossings.value_b.copy()
+    for step in range(refine + 1):
+        along = low + (high - low) * (value_low / (value_low - value_high))
+        nodes = crossings.node_a.astype(np.float64)
+        nodes[np.arange(len(nodes)), crossings.axis] += np.clip(along, MARGIN, 1 - MARGIN)
+        vertices = (lattice.origin + nodes * lattice.spacing).astype(np.float32)
+        if step < refine:
+            value = evaluator.at(vertices).astype(np.float64)
+            below = (value > 0) == (value_low > 0)  # the crossing is further along
+            low, value_low = np.where(below, along, low), np.where(below, value, value_low)
+            high, value_high = np.where(below, high, along), np.where(below, value_high, value)
+    return vertices
+
+
 class _Evaluator:
     """Evaluates the field at lattice nodes, chunk by chunk, and counts."""
 
@@ -221,59 +264,29 @@ class _Evaluator:
         self.points = 0
         self.calls = 0
 
-    @torch.no_grad()
     def fill(self, lattice: Lattice, values: np.ndarray, wanted: np.ndarray) -> None:
-        """Set `values` at the `wanted` nodes to field minus level, never exactly 0 and never infinite."""
+        """Set `values` at the `wanted` nodes to field minus level."""
         flat = np.flatnonzero(wanted)
         out = values.reshape(-1)
-        largest = np.finfo(np.float32).max / 4
         for begin in range(0, len(flat), self.chunk):
             part = flat[begin : begin + self.chunk]
-            points = torch.from_numpy(lattice.positions(part))
+            out[part] = self.at(lattice.positions(part))
+
+    @torch.no_grad()
+    def at(self, positions: np.ndarray) -> np.ndarray:
+        """Return field minus level at positions [N, 3] float32, never infinite, [N] float32."""
+        out = np.empty(len(positions), dtype=np.float32)
+        largest = np.finfo(np.float32).max / 4
+        for begin in range(0, len(positions), self.chunk):
+            part = slice(begin, begin + self.chunk)
+            points = torch.from_numpy(positions[part])
             result = self.field(points)
             if result.shape != points.shape[:1]:
-                raise ValueError(f"field: wanted {len(part)} values for as many points, got shape {list(result.shape)}")
+                raise ValueError(f"field: wanted {len(points)} values for as many points, got shape {list(result.shape)}")
             result_np = result.detach().to("cpu", torch.float32).numpy() - np.float32(self.level)
             if np.isnan(result_np).any():
-                raise ValueError(f"field: wanted numbers, got NaN at {np.isnan(result_np).sum()} of {len(part)} points")
+                raise ValueError(f"field: wanted numbers, got NaN at {np.isnan(result_np).sum()} of {len(points)} points")
             out[part] = np.clip(result_np, -largest, largest)
-            self.points += len(part)
+            self.points += len(points)
             self.calls += 1
-
-
-def _march(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Run marching cubes on a closed lattice of values and return vertices in node units, float64, and faces.
-
-    scikit-image is given only the signs and returns the middles of edges, exactly; slabs join by these numbers. The classic
-    table then gives closed manifolds for any signs (tested on noise), which the topology-aware one does not. The
-    vertices move to where the values cross zero, in float64, afterwards.
-    """
-    from skimage.measure import marching_cubes
-
-    doubled = np.array([2 * n for n in values.shape], dtype=np.int64)
-    keys_parts, faces_parts, count = [], [], 0
-    for begin in range(0, values.shape[0] - 1, _SLAB):
-        slab = values[begin : begin + _SLAB + 1] > 0
-        cells = mixed_cells(slab)
-        if not cells.any():
-            continue
-        # Crop to the cells that matter: the empty ones are most of the slab and cost as much.
-        box = [np.flatnonzero(cells.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
-        offset = np.array([nodes[0] for nodes in box])
-        crop = slab[tuple(slice(nodes[0], nodes[-1] + 2) for nodes in box)]
-        signs = np.where(crop, np.float32(1), np.float32(-1))
-        middles, faces, _, _ = marching_cubes(signs, 0.0, method="lorensen", gradient_direction="ascent")
-        twice = np.rint(middles * 2).astype(np.int64) + 2 * (offset + (begin, 0, 0))
-        keys_parts.append((twice[:, 0] * doubled[1] + twice[:, 1]) * doubled[2] + twice[:, 2])
-        faces_parts.append(faces.astype(np.int64) + count)
-        count += len(twice)
-    keys, inverse = np.unique(np.concatenate(keys_parts), return_inverse=True)
-    faces = inverse.ravel()[np.concatenate(faces_parts)]
-
-    twice = np.stack([keys // (doubled[1] * doubled[2]), keys // doubled[2] % doubled[1], keys % doubled[2]], axis=1)
-    node_a = twice // 2
-    node_b = (twice + 1) // 2
-    value_a = values[tuple(node_a.T)].astype(np.float64)
-    value_b = values[tuple(node_b.T)].astype(np.float64)
-    along = np.clip(value_a / (value_a - value_b), _MARGIN, 1 - _MARGIN)
-    return node_a + along[:, None] * (node_b - node_a), faces.astype(np.int32)
+        return out

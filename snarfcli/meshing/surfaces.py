@@ -75,10 +75,10 @@ def field_surface(
     def posed_logits(points: Tensor) -> Tensor:
         return avatar.query(points[None], transforms[None], pose[None]).logits[0].clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
 
-    mesh = extract_surface(posed_logits, lower, upper, resolution, keep_share=keep_share, chunk=chunk).with_normals()
-    return (
-        mesh if weights_from is None else replace(mesh, weights=_borrow_weights(avatar, transforms, mesh, weights_from))
-    )
+    mesh = extract_surface(
+        posed_logits, lower, upper, resolution, widen=True, keep_share=keep_share, chunk=chunk
+    ).with_normals()
+    return mesh if weights_from is None else replace(mesh, weights=_borrow_weights(avatar, transforms, mesh, weights_from))
 
 
 @torch.no_grad()
@@ -100,7 +100,7 @@ def canonical_surface(
     def canonical_logits(points_c: Tensor) -> Tensor:
         return avatar.canonical_logits(points_c, pose).clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
 
-    mesh = extract_surface(canonical_logits, lower, upper, resolution, keep_share=keep_share, chunk=chunk)
+    mesh = extract_surface(canonical_logits, lower, upper, resolution, widen=True, keep_share=keep_share, chunk=chunk)
     weights = _in_chunks(avatar.skinning_weights, mesh.vertices)
     return replace(mesh, weights=weights).with_normals()
 
@@ -134,6 +134,7 @@ def posed_mesh(
     *,
     surface: str = "field",
     weights_from: Mesh | None = None,
+    keep_share: float = 0.01,
 ) -> Mesh:
     """Return the surface of the kind `surface`, see `SURFACES`; `weights_from` serves `field` only.
 
@@ -142,9 +143,9 @@ def posed_mesh(
         EmptySurface, FullSurface: the field has no surface.
     """
     if surface == "field":
-        return field_surface(avatar, pose, translation, resolution, weights_from=weights_from)
+        return field_surface(avatar, pose, translation, resolution, weights_from=weights_from, keep_share=keep_share)
     if surface == "skinned":
-        return skinned_surface(avatar, pose, translation, resolution)
+        return skinned_surface(avatar, pose, translation, resolution, keep_share=keep_share)
     raise ValueError(f"surface: wanted one of {', '.join(SURFACES)}, got {surface!r}")
 
 

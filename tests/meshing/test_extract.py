@@ -7,7 +7,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter, map_coordinates
 from toy_avatar import capsule
 
-from snarfcli.meshing.extract import EmptySurface, FullSurface, _march, extract_surface
+from snarfcli.meshing.extract import EmptySurface, FullSurface, extract_surface
 from snarfcli.meshing.mesh import Mesh
 
 BOX = ([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0])
@@ -87,17 +87,6 @@ def test_the_chunk_size_changes_nothing():
     other = extract_surface(torus, *BOX, 64, coarse=16, chunk=777)
     np.testing.assert_array_equal(one.vertices, other.vertices)
     np.testing.assert_array_equal(one.faces, other.faces)
-
-
-def test_any_signs_give_closed_manifolds():
-    rng = np.random.default_rng(0)
-    values = rng.standard_normal((45, 21, 30)).astype(np.float32)  # longer than a slab along the first axis
-    values[rng.random(values.shape) < 0.2] = 0.0
-    values[[0, -1]] = values[:, [0, -1]] = values[:, :, [0, -1]] = -1
-    vertices, faces = _march(values)
-    solid = trimesh.Trimesh(vertices, faces, process=False)
-    assert solid.is_watertight and solid.is_winding_consistent and solid.volume > 0
-    assert len(np.unique(vertices, axis=0)) == len(vertices)
 
 
 def test_smooth_noise_is_closed_at_every_level():
@@ -184,6 +173,27 @@ def test_a_surface_that_leaves_the_box_is_closed():
     assert not extract_surface(sphere, *BOX, 48).stats.capped
 
 
+def test_a_box_that_is_too_small_widens_where_it_must():
+    mesh = extract_surface(sphere, [-1, -1, -1], [0.3, 1, 1], 64, coarse=16, widen=True)
+    assert not mesh.stats.capped
+    assert assert_closed(mesh).volume == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=2e-3)
+    exact = extract_surface(sphere, *BOX, 64, coarse=16, widen=True)
+    np.testing.assert_array_equal(exact.vertices, extract_surface(sphere, *BOX, 64, coarse=16).vertices)
+    endless = extract_surface(lambda p: 0.5 - p[:, 1:].norm(dim=1), *BOX, 32, widen=True)
+    assert endless.stats.capped and np.ptp(endless.vertices[:, 0]) < 4.5
+
+
+def test_refinement_removes_terraces():
+    def steep(points):  # far from linear within a cell
+        return torch.expm1(12 * sphere(points))
+
+    distance = [
+        np.abs(np.linalg.norm(extract_surface(steep, *BOX, 32, refine=refine).vertices, axis=1) - 0.8).max()
+        for refine in (0, 1, 3)
+    ]
+    assert distance[1] < 0.5 * distance[0] and distance[2] < 0.1 * distance[0]
+
+
 def test_no_surface_is_a_clear_error():
     with pytest.raises(EmptySurface, match="unoccupied at all"):
         extract_surface(lambda p: -torch.ones(len(p)), *BOX, 32)
@@ -199,6 +209,7 @@ def test_no_surface_is_a_clear_error():
         ({"resolution": 2}, "resolution: wanted at least 4"),
         ({"chunk": 0}, "chunk: wanted at least 1"),
         ({"coarse": 0}, "coarse: wanted at least 1"),
+        ({"refine": -1}, "refine: wanted at least 0"),
         ({"dilate": -1}, "dilate: wanted at least 0"),
         ({"keep_share": 2.0}, "keep_share: wanted a share"),
         ({"field": lambda p: p}, "field: wanted .* values"),

@@ -69,6 +69,15 @@ def test_a_point_without_correspondence_does_not_step_the_surface():
     assert solid_of(mesh).body_count == 1
 
 
+def test_a_box_that_is_too_small_grows(monkeypatch):
+    avatar = ToyAvatar()
+    tight = (torch.tensor([0.0, -0.2, -0.2]), torch.tensor([2 * LENGTH - 0.1, 0.2, 0.2]))
+    monkeypatch.setattr(avatar, "posed_box", lambda transforms: tight)
+    mesh = field_surface(avatar, bent(0.0), None, 64)
+    assert not mesh.stats.capped
+    assert solid_of(mesh).volume == pytest.approx(VOLUME, rel=0.02)
+
+
 def test_an_empty_avatar_says_so():
     with pytest.raises(EmptySurface):
         field_surface(ToyAvatar(radius=-1.0), bent(0.0), None, 32)

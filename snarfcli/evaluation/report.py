@@ -106,7 +106,7 @@ def timings_text(evaluation: Evaluation) -> str:
     return (
         f"time for {REFERENCE_POINTS:,} points: search {times['search_ms_per_200k']:.1f} ms, "
         f"shape {times['shape_ms_per_200k']:.1f} ms, total {times['total_ms_per_200k']:.1f} ms\n"
-        f"{len(evaluation.frames)} frames in {evaluation.wall_s:.1f} s on {times['device']}, {where}"
+        f"{len(evaluation.frames)} frame{'' if len(evaluation.frames) == 1 else 's'} in {evaluation.wall_s:.1f} s on {times['device']}, {where}"
     )
 
 

@@ -101,13 +101,17 @@ def timings_text(evaluation: Evaluation) -> str:
     """Return two lines: the times for as many points as in the papers' table, and where and how long it ran."""
     times = _timings(evaluation)
     machine = evaluation.machine["machine"]
-    threads = f"{machine['threads']} thread" + ("" if machine["threads"] == 1 else "s")
+    threads, frames = _counted(machine["threads"], "thread"), _counted(len(evaluation.frames), "frame")
     where = machine["gpu"] if times["device"] != "cpu" and "gpu" in machine else threads
     return (
         f"time for {REFERENCE_POINTS:,} points: search {times['search_ms_per_200k']:.1f} ms, "
         f"shape {times['shape_ms_per_200k']:.1f} ms, total {times['total_ms_per_200k']:.1f} ms\n"
-        f"{len(evaluation.frames)} frame{'' if len(evaluation.frames) == 1 else 's'} in {evaluation.wall_s:.1f} s on {times['device']}, {where}"
+        f"{frames} in {evaluation.wall_s:.1f} s on {times['device']}, {where}"
     )
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" + ("" if count == 1 else "s")
 
 
 def _timings(evaluation: Evaluation) -> dict[str, Any]:

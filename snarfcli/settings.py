@@ -28,10 +28,10 @@ def group_options(group: str) -> list[str]:
 
 
 def group_schemas(schema: type) -> dict[str, type]:
-    """Return the fields of a dataclass that are dataclasses themselves, by name."""
+    """Return the fields of a dataclass that are dataclasses themselves, or may be, by name."""
     hints = typing.get_type_hints(schema)
-    nested = {field.name: hints[field.name] for field in dataclasses.fields(schema)}
-    return {name: hint for name, hint in nested.items() if dataclasses.is_dataclass(hint)}
+    kinds = {field.name: typing.get_args(hints[field.name]) or (hints[field.name],) for field in dataclasses.fields(schema)}
+    return {name: kind for name, options in kinds.items() for kind in options if dataclasses.is_dataclass(kind)}
 
 
 def describe(schema: type) -> Iterator[tuple[str, str]]:
@@ -70,6 +70,7 @@ def check_overrides(overrides: Sequence[str], schema: type) -> None:
     parser = OverridesParser.create()
     names = setting_names(schema)
     groups = group_schemas(schema)
+    hints = typing.get_type_hints(schema)
     for text in overrides:
         try:
             override = parser.parse_override(text)
@@ -81,6 +82,10 @@ def check_overrides(overrides: Sequence[str], schema: type) -> None:
             continue
         if key not in names:
             raise UserError(f"unknown setting '{key}'{nearest(key, names)}; \"--help\" lists all settings")
+        group = key.split(".")[0]
+        is_chosen = any(other.startswith(f"{group}=") for other in overrides)
+        if group != key and type(None) in typing.get_args(hints[group]) and not is_chosen:
+            raise UserError(f"{key} needs a choice of {group} with it, such as {group}={group_options(group)[0]}")
         if key in groups:
             options = group_options(key)
             for option in _values(override):

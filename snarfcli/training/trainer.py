@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
+from snarfcli.evaluation.metrics import iou
 from snarfcli.models.avatar import Avatar
 from snarfcli.models.extent import bone_segments
 from snarfcli.precision import PRECISIONS, matmul_precision
@@ -126,8 +127,9 @@ class Trainer:
             sequence, frame = frames[index]
             batch = load_frames([(sequence, frame, np.arange(0, sequence.num_points, 2))], self.device)
             inside = avatar.query(batch.points, batch.bone_transforms, batch.pose).logits > 0
-            half = inside.shape[1] // 2
-            values.append([_iou(inside[:, part], batch.occupied[:, part]) for part in (slice(half), slice(half, None))])
+            inside, occupied = inside[0].cpu().numpy(), batch.occupied[0].cpu().numpy()
+            half = len(inside) // 2
+            values.append([iou(inside[:half], occupied[:half]), iou(inside[half:], occupied[half:])])
         if not values:
             return {}
         bbox, surface = np.mean(values, 0)
@@ -173,12 +175,6 @@ class Trainer:
             reason = str(error).splitlines()[0]
             raise UserError(f"{path} does not fit this version ({reason}); start again with overwrite=true") from None
         self.model.train()
-
-
-def _iou(predicted: torch.Tensor, wanted: torch.Tensor) -> float:
-    """Return intersection over union of two boolean masks; 1 where both are empty."""
-    union = (predicted | wanted).sum()
-    return float((predicted & wanted).sum() / union) if union else 1.0
 
 
 def _differences(theirs: Any, ours: Any, prefix: str = "") -> list[str]:

@@ -56,7 +56,7 @@ def contact_sheet(
     if captions is not None and [len(line) for line in captions] != [len(row) for row in rows]:
         raise ValueError("captions: wanted one for each picture, row by row")
 
-    small, large = _font(max(12, width // 22)), _font(max(15, width // 16))
+    small, large = _font(min(max(12, width // 24), 20)), _font(min(max(15, width // 17), 28))
     line_s, line_l = _line(small), _line(large)
     top = _GAP + (line_l if title else 0) + (line_s if column_labels else 0)
     row_height = (line_s if row_labels else 0) + height + (line_s if captions else 0) + _GAP

@@ -10,13 +10,13 @@ the one of the full lattice.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from snarfcli.meshing.lattice import Lattice, any_corner, grow, mixed_cells, nodes_of_cells
+from snarfcli.meshing.lattice import Lattice, any_corner, first_lattice, grow, mixed_cells, nodes_of_cells
 from snarfcli.meshing.marching import MARGIN, Crossings, march
 from snarfcli.meshing.mesh import ExtractionStats, Mesh, keep_components
 
@@ -27,7 +27,7 @@ __all__ = ["EmptySurface", "FullSurface", "extract_surface"]
 _COARSE = (32, 64)
 # Cells around the mixed ones that are split as well, on all levels but the last.
 _DILATE = 1
-# Steps in which a box that was too small is widened by up to half of its longest side, each way.
+# Times that a box is widened, each by a sixteenth of its longest side.
 _WIDENINGS = 8
 # Node layers looked at together: bounds the memory, not the result.
 _SLAB = 32
@@ -67,8 +67,8 @@ def extract_surface(
         coarse: cells along the longest side of the first lattice, at least; loose parts smaller than such a cell can be
             missed. By default a quarter of `resolution`, within 32 and 64.
         dilate: cells around the surface that are split as well, on all levels but the last.
-        widen: where the field is occupied at the border of the box, move the border outwards until it is not, at most by
-            half the box. For boxes that are an estimate.
+        widen: where the field is occupied at the border of the box, move the border outwards until it is not, or the box is
+            two and a half times as large. For boxes that are an estimate.
         refine: evaluations at each vertex that move it along its lattice edge to where the field really crosses `level`.
             Without one, a field that is not linear within a cell shows terraces.
         keep_share: connected surfaces with fewer faces than this share of the largest one's are dropped.
@@ -85,7 +85,7 @@ def extract_surface(
     start = time.perf_counter()
     if coarse is None:
         coarse = min(max(resolution // 4, _COARSE[0]), _COARSE[1])
-    lattice = _first_lattice(lower, upper, resolution, coarse)
+    lattice = first_lattice(lower, upper, resolution, coarse)
     for name, value, least in (("chunk", chunk, 1), ("dilate", dilate, 0), ("refine", refine, 0)):
         if value < least:
             raise ValueError(f"{name}: wanted at least {least}, got {value}")
@@ -93,9 +93,8 @@ def extract_surface(
         raise ValueError(f"keep_share: wanted a share between 0 and 1, got {keep_share}")
     evaluator = _Evaluator(field, level, chunk)
 
-    wanted = np.ones(lattice.shape, dtype=bool)
     values = np.empty(lattice.shape, dtype=np.float32)
-    evaluator.fill(lattice, values, wanted)
+    evaluator.fill(lattice, values, np.ones(lattice.shape, dtype=bool))
     inside = values > 0
     if not inside.any():
         raise EmptySurface(f"the field is unoccupied at all {inside.size} points of the first lattice, so there is no surface")
@@ -103,13 +102,54 @@ def extract_surface(
         raise FullSurface(
             f"the field is occupied at all {inside.size} points of the first lattice, so it has no surface in the box"
         )
-    if widen:
-        lattice, values = _widen(evaluator, lattice, values)
-    capped = _close_border(values)
-    known = np.ones(lattice.shape, dtype=bool)
+    for widening in range(_WIDENINGS + 1):
+        last = widening == _WIDENINGS or not widen
+        sides = _occupied_sides(values)
+        if last or not sides.any():
+            final, final_values, sides = _descend(evaluator, lattice, values.copy(), dilate)
+        if last or not sides.any():
+            break
+        lattice, values = _widen(evaluator, lattice, values, sides)
 
+    crossings = march(final_values)
+    vertices = _place(evaluator, final, crossings, refine)
+    faces = crossings.faces
+    vertices, faces, found, kept = keep_components(vertices, faces, keep_share)
+    stats = ExtractionStats(
+        points=evaluator.points,
+        calls=evaluator.calls,
+        voxel=float(final.spacing),
+        components=found,
+        kept=kept,
+        capped=bool(sides.any()),
+        seconds=time.perf_counter() - start,
+    )
+    return Mesh(vertices, faces, stats=stats)
+
+
+def _widen(evaluator: _Evaluator, lattice: Lattice, values: np.ndarray, sides: np.ndarray) -> tuple[Lattice, np.ndarray]:
+    """Add cells to the first lattice on some sides, bool [3, 2], and evaluate them."""
+    pads = sides * max(1, max(lattice.shape) // (2 * _WIDENINGS))
+    wanted = np.pad(np.zeros(lattice.shape, dtype=bool), pads, constant_values=True)
+    values = np.pad(values, pads)
+    origin = lattice.origin - pads[:, 0] * lattice.spacing * lattice.stride
+    lattice = Lattice(origin, lattice.spacing, lattice.stride, wanted.shape)
+    evaluator.fill(lattice, values, wanted)
+    return lattice, values
+
+
+def _descend(
+    evaluator: _Evaluator, lattice: Lattice, values: np.ndarray, dilate: int
+) -> tuple[Lattice, np.ndarray, np.ndarray]:
+    """Refine from the first lattice, all of whose values are known, to the last.
+
+    Returns:
+        the last lattice, its values, and the sides, bool [3, 2], on which occupied nodes had to be closed.
+    """
+    known = np.ones(lattice.shape, dtype=bool)
+    sides = _close_border(values)
     while lattice.stride > 1:
-        capped |= _complete(evaluator, lattice, values, known)
+        sides |= _complete(evaluator, lattice, values, known)
         cells = mixed_cells(values > 0)
         if lattice.stride > 2:
             grow(cells, dilate)
@@ -118,63 +158,9 @@ def extract_surface(
         wanted &= ~known
         evaluator.fill(lattice, values, wanted)
         known |= wanted
-        capped |= _close_border(values)
-    capped |= _complete(evaluator, lattice, values, known)
-    del known, wanted
-
-    crossings = march(values)
-    del values
-    vertices = _place(evaluator, lattice, crossings, refine)
-    faces = crossings.faces
-    vertices, faces, found, kept = keep_components(vertices, faces, keep_share)
-    stats = ExtractionStats(
-        points=evaluator.points,
-        calls=evaluator.calls,
-        voxel=float(lattice.spacing),
-        components=found,
-        kept=kept,
-        capped=capped,
-        seconds=time.perf_counter() - start,
-    )
-    return Mesh(vertices, faces, stats=stats)
-
-
-def _first_lattice(lower: Tensor | np.ndarray, upper: Tensor | np.ndarray, resolution: int, coarse: int) -> Lattice:
-    """Return the coarsest lattice: the box with one of its cells around it, centred on it."""
-    corners = [np.asarray(torch.as_tensor(corner).detach().cpu(), dtype=np.float64) for corner in (lower, upper)]
-    for name, corner in zip(("lower", "upper"), corners, strict=True):
-        if corner.shape != (3,) or not np.isfinite(corner).all():
-            raise ValueError(f"{name}: wanted three finite numbers, got {corner.tolist()}")
-    size = corners[1] - corners[0]
-    if not (size > 0).all():
-        raise ValueError(f"upper: wanted more than lower {corners[0].tolist()} on each axis, got {corners[1].tolist()}")
-    if resolution < 4:
-        raise ValueError(f"resolution: wanted at least 4 cells, got {resolution}")
-    if coarse < 1:
-        raise ValueError(f"coarse: wanted at least 1 cell, got {coarse}")
-    stride = 1
-    while resolution >= 2 * stride * coarse:
-        stride *= 2
-    spacing = size.max() / resolution
-    # The small number keeps rounding from adding a layer of cells to a box that is a multiple of a cell.
-    cells = np.ceil(size / (spacing * stride) - 1e-6).astype(int) + 2
-    origin = (corners[0] + corners[1] - cells * spacing * stride) / 2
-    return Lattice(origin=origin, spacing=spacing, stride=stride, shape=tuple(int(n) + 1 for n in cells))
-
-
-def _widen(evaluator: _Evaluator, lattice: Lattice, values: np.ndarray) -> tuple[Lattice, np.ndarray]:
-    """Add cells to the first lattice on the sides where it is occupied, and evaluate them."""
-    step = max(1, max(lattice.shape) // (2 * _WIDENINGS))
-    for _ in range(_WIDENINGS):
-        pads = [tuple(step * bool((values.take(end, axis) > 0).any()) for end in (0, -1)) for axis in range(3)]
-        if not np.any(pads):
-            break
-        wanted = np.pad(np.zeros(lattice.shape, dtype=bool), pads, constant_values=True)
-        values = np.pad(values, pads)
-        origin = lattice.origin - np.array([before for before, _ in pads]) * lattice.spacing * lattice.stride
-        lattice = Lattice(origin, lattice.spacing, lattice.stride, wanted.shape)
-        evaluator.fill(lattice, values, wanted)
-    return lattice, values
+        sides |= _close_border(values)
+    sides |= _complete(evaluator, lattice, values, known)
+    return lattice, values, sides
 
 
 def _split(lattice: Lattice, values: np.ndarray, known: np.ndarray) -> tuple[Lattice, np.ndarray, np.ndarray]:
@@ -190,23 +176,23 @@ def _split(lattice: Lattice, values: np.ndarray, known: np.ndarray) -> tuple[Lat
     return finer, fine_values, fine_known
 
 
-def _complete(evaluator: _Evaluator, lattice: Lattice, values: np.ndarray, known: np.ndarray) -> bool:
+def _complete(evaluator: _Evaluator, lattice: Lattice, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Evaluate the unknown corners of mixed cells, and around them, until every mixed cell is known.
 
     Returns:
-        True if an occupied node on the border had to be closed.
+        the sides on which occupied nodes had to be closed, bool [3, 2].
     """
-    capped = False
+    sides = np.zeros((3, 2), dtype=bool)
     while True:
         cells = _unfinished(values, known)
         if cells is None:
-            return capped
+            return sides
         grow(cells, 1)
         wanted = nodes_of_cells(cells)
         wanted &= ~known
         evaluator.fill(lattice, values, wanted)
         known |= wanted
-        capped |= _close_border(values)
+        sides |= _close_border(values)
 
 
 def _unfinished(values: np.ndarray, known: np.ndarray) -> np.ndarray | None:
@@ -225,16 +211,27 @@ def _unfinished(values: np.ndarray, known: np.ndarray) -> np.ndarray | None:
     return cells
 
 
-def _close_border(values: np.ndarray) -> bool:
-    """Make the outermost nodes unoccupied and say whether any of them was not."""
-    capped = False
+def _faces(values: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Yield axis, end (0 or 1) and view of the six outermost layers of nodes."""
     for axis in range(3):
-        for end in (0, -1):
-            face = values[(slice(None),) * axis + (end,)]
-            if (face > 0).any():
-                capped = True
-                np.negative(face, out=face, where=face > 0)
-    return capped
+        for end in (0, 1):
+            yield axis, end, values[(slice(None),) * axis + (-end,)]
+
+
+def _occupied_sides(values: np.ndarray) -> np.ndarray:
+    """Return which sides have an occupied node on the border, bool [3, 2]."""
+    sides = np.zeros((3, 2), dtype=bool)
+    for axis, end, face in _faces(values):
+        sides[axis, end] = (face > 0).any()
+    return sides
+
+
+def _close_border(values: np.ndarray) -> np.ndarray:
+    """Make the outermost nodes unoccupied; return on which sides some were not, bool [3, 2]."""
+    sides = _occupied_sides(values)
+    for _, _, face in _faces(values):
+        np.negative(face, out=face, where=face > 0)
+    return sides
 
 
 def _place(evaluator: _Evaluator, lattice: Lattice, crossings: Crossings, refine: int) -> np.ndarray:

@@ -1,12 +1,14 @@
-"""Boolean arithmetic on the nodes and cells of a regular lattice; node arrays have one more entry per axis than cell arrays."""
+"""Regular lattices, and boolean arithmetic on their nodes and cells; there is one cell less than nodes along each axis."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
-__all__ = ["Lattice", "any_corner", "grow", "mixed_cells", "nodes_of_cells"]
+__all__ = ["Lattice", "any_corner", "first_lattice", "grow", "mixed_cells", "nodes_of_cells"]
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,39 @@ class Lattice:
         """Return the positions of nodes, [N, 3] float32, given by their flat index [N]."""
         index = np.stack(np.unravel_index(flat, self.shape), axis=1) * self.stride
         return (self.origin + index * self.spacing).astype(np.float32)
+
+
+def first_lattice(lower: Tensor | np.ndarray, upper: Tensor | np.ndarray, resolution: int, coarse: int) -> Lattice:
+    """Return the coarsest lattice: a box with one cell around it, centred on it.
+
+    Args:
+        lower: [3] corner of the box, metres.
+        upper: [3] opposite corner.
+        resolution: cells of the final lattice along the longest side.
+        coarse: cells of the coarsest lattice along the longest side, at least.
+
+    Raises:
+        ValueError: a corner is not finite, the box is empty, or a number is too small.
+    """
+    corners = [np.asarray(torch.as_tensor(corner).detach().cpu(), dtype=np.float64) for corner in (lower, upper)]
+    for name, corner in zip(("lower", "upper"), corners, strict=True):
+        if corner.shape != (3,) or not np.isfinite(corner).all():
+            raise ValueError(f"{name}: wanted three finite numbers, got {corner.tolist()}")
+    size = corners[1] - corners[0]
+    if not (size > 0).all():
+        raise ValueError(f"upper: wanted more than lower {corners[0].tolist()} on each axis, got {corners[1].tolist()}")
+    if resolution < 4:
+        raise ValueError(f"resolution: wanted at least 4 cells, got {resolution}")
+    if coarse < 1:
+        raise ValueError(f"coarse: wanted at least 1 cell, got {coarse}")
+    stride = 1
+    while resolution >= 2 * stride * coarse:
+        stride *= 2
+    spacing = size.max() / resolution
+    # The small number keeps rounding from adding a layer of cells to a box that is a multiple of a cell.
+    cells = np.ceil(size / (spacing * stride) - 1e-6).astype(int) + 2
+    origin = (corners[0] + corners[1] - cells * spacing * stride) / 2
+    return Lattice(origin=origin, spacing=spacing, stride=stride, shape=tuple(int(n) + 1 for n in cells))
 
 
 def _pair(nodes: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

@@ -180,7 +180,18 @@ def test_a_box_that_is_too_small_widens_where_it_must():
     exact = extract_surface(sphere, *BOX, 64, coarse=16, widen=True)
     np.testing.assert_array_equal(exact.vertices, extract_surface(sphere, *BOX, 64, coarse=16).vertices)
     endless = extract_surface(lambda p: 0.5 - p[:, 1:].norm(dim=1), *BOX, 32, widen=True)
-    assert endless.stats.capped and np.ptp(endless.vertices[:, 0]) < 4.5
+    assert endless.stats.capped and np.ptp(endless.vertices[:, 0]) < 5.2
+
+
+def test_a_thin_part_that_leaves_the_box_between_coarse_nodes_is_followed():
+    radius = 1.5 * 2 / 256
+
+    def field(points):
+        return torch.maximum(0.3 - points.norm(dim=1), capsule(points, (0.011, 0.007, 0.0), (0.9, 0.007, 0.0), radius))
+
+    mesh = extract_surface(field, [-0.4, -1, -1], [0.6, 1, 1], 256, widen=True)
+    assert not mesh.stats.capped
+    assert assert_closed(mesh).bounds[1, 0] == pytest.approx(0.9 + radius, abs=2e-3)
 
 
 def test_refinement_removes_terraces():

@@ -168,7 +168,7 @@ def _floor_shadow(scene: LitScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     tall = max(float(high[1]) - scene.floor_y, 0.05)
     thrown = -scene.key[[0, 2]] / scene.key[1] * tall
     corners = np.stack([low[[0, 2]], high[[0, 2]], low[[0, 2]] + thrown, high[[0, 2]] + thrown])
-    margin = 0.25 * tall
+    margin = 0.45 * tall
     lower, upper = corners.min(axis=0) - margin, corners.max(axis=0) + margin
     cell = (upper - lower) / _FLOOR_CELLS
     index = np.stack(np.meshgrid(np.arange(_FLOOR_CELLS), np.arange(_FLOOR_CELLS), indexing="ij"), axis=-1).reshape(-1, 2)
@@ -179,12 +179,12 @@ def _floor_shadow(scene: LitScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     dome, key = scene.gather(points, normals, phase, floor=False)
     grid = np.stack([dome.mean(axis=1), key]).reshape(2, _FLOOR_CELLS, _FLOOR_CELLS)
     grid = np.stack([gaussian_filter(uniform_filter(g, PATTERN, mode="nearest"), 0.9) for g in grid])
-    dome = grid[0] / grid[0].max()
+    dome = np.minimum(grid[0] / np.percentile(grid[0], 90), 1)  # the farthest tenth counts as open
     light = 0.58 * dome**1.6 + 0.42 * grid[1]
     # The border of the grid must be unshaded, or its edge would show on the floor.
-    edge = np.minimum(np.arange(_FLOOR_CELLS), np.arange(_FLOOR_CELLS)[::-1]) / (0.12 * _FLOOR_CELLS)
+    edge = np.minimum(np.arange(_FLOOR_CELLS), np.arange(_FLOOR_CELLS)[::-1]) / (0.2 * _FLOOR_CELLS)
     inner = np.minimum(np.minimum.outer(edge, edge), 1)
-    return 1 - (1 - light) * inner, lower, cell
+    return 1 - (1 - light) * inner * inner * (3 - 2 * inner), lower, cell
 
 
 def from_srgb(color: np.ndarray) -> np.ndarray:

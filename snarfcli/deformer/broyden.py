@@ -90,8 +90,8 @@ def _iterate(
 
     def evaluate(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         cell, local = locate(x, grid, shape)
-        corners = cell_corners(cell, shape)
-        posed, by_local = forward_jacobian(transforms[corners], local, x - local * size, size)
+        corners = transforms.index_select(0, cell_corners(cell, shape).reshape(-1)).reshape(-1, 8, 12)
+        posed, by_local = forward_jacobian(corners, local, x - local * size, size)
         return posed, by_local / size, cell, local
 
     x = canonical.clamp(grid.lower, grid.upper)

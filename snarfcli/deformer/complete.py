@@ -2,8 +2,10 @@
 
 Inside one cell T(x) is a convex combination of the eight corner transforms T_k, so d(cell) lies inside the box spanned by
 T_k [x; 1] over the corners k and the x of the cell. The queries inside that box are the only ones that can have a root in the
-cell, and Newton's method with the exact Jacobian of the trilinear field finds it from the cell's centre. No start bones,
-nothing to tune, and a query outside all boxes is known to have no correspondence at all.
+cell. The first step of Newton's method from the cell's centre needs nothing but the centre's value and inverse Jacobian,
+which all queries of a cell share; where it leads too far out of the cell for how curved the field is in it, there is no root.
+What remains, hardly more than the roots, is solved with the exact Jacobian of the trilinear field. No start bones, nothing to
+tune, and a query outside all boxes is known to have no correspondence at all.
 
 This is the readable version in PyTorch. A cell in which the determinant of the Jacobian changes sign may hold several roots
 for one query; one start finds one of them.
@@ -14,15 +16,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from snarfcli.deformer.grid import CanonicalGrid, cell_corners
+from snarfcli.deformer.grid import CORNERS, CanonicalGrid, cell_corners
 from snarfcli.deformer.search import Roots, drop_duplicates, invert_3x3
 from snarfcli.deformer.skinning import forward_jacobian
 
 __all__ = ["complete_roots", "posed_cell_boxes"]
 
-_QUERIES_AT_ONCE = 65_536  # bounds the memory: about 20 candidate cells of 450 bytes for a query near the body
+_QUERIES_AT_ONCE = 65_536  # bounds the memory: about 20 candidate cells for a query near the body
+_CELLS_AT_ONCE = 200_000  # likewise: 400 bytes of corner transforms a cell, and as much for each intermediate result
 _BINS_PER_SIDE = 96
-_STRAY = 1.25  # cells from the centre at which a candidate is given up; a neighbour then owns the root, if there is one
+_STRAY = 0.75  # of a cell beyond the cell at which a candidate is given up; a neighbour owns the root, if there is one
+_CURVED = 2.0  # times the field's deviation from linear at the corners, for what it may be between them
+_SLACK = 0.1  # of a cell, beyond that
 _FACE_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}  # of a cell; rounding may put a root on a face outside both
 _POLISH = 1e-2  # of a cell; so short a step leaves the Jacobian as it is
 _SAME_ROOT = 5e-3  # of a cell; Newton's last step leaves errors a hundred times smaller
@@ -53,27 +58,35 @@ def complete_roots(
         The roots of all queries, without duplicates.
     """
     batch, count = points.shape[:2]
-    total_cells = (shape[0] - 1) * (shape[1] - 1) * (shape[2] - 1)
     if active_cells is None:
-        cells = torch.arange(total_cells, device=points.device)
+        cells = torch.arange((shape[0] - 1) * (shape[1] - 1) * (shape[2] - 1), device=points.device)
     else:
         cells = active_cells.reshape(-1).nonzero()[:, 0]
     corners = cell_corners(cells, shape)
     origins = grid.nodes(shape).reshape(-1, 3)[corners[:, 0]]
     size = grid.cell_size(shape)
+    # Several poses go through every operation together, as long as that does not need much memory.
+    poses_at_once = max(1, min(_CELLS_AT_ONCE // max(len(cells), 1), _QUERIES_AT_ONCE // max(count, 1)))
     parts = []
-    for b in range(batch):
-        corner_transforms = transforms[b][corners]
-        lower, upper = posed_cell_boxes(corner_transforms, origins, size)
+    for first in range(0, batch, poses_at_once):
+        some = transforms[first : first + poses_at_once]
+        corner_transforms = some[:, corners].reshape(-1, 8, 12)
+        places = origins.repeat(len(some), 1)
+        boxes = posed_cell_boxes(corner_transforms, places, size)
+        centres = _centres(corner_transforms, places, size)
         for start in range(0, max(count, 1), _QUERIES_AT_ONCE):
-            queries = points[b, start : start + _QUERIES_AT_ONCE]
-            query, candidate = _candidates(queries, lower, upper)
-            roots = _newton(queries, query, candidate, corner_transforms, origins, size, tolerance, max_steps)
-            roots.query += b * count + start
-            roots.cell = cells[roots.cell]
+            queries = points[first : first + len(some), start : start + _QUERIES_AT_ONCE]
+            flat = queries.reshape(-1, 3)
+            query, cell = _candidates(queries, *boxes)
+            query, cell, local = _first_step(flat, query, cell, *centres)
+            roots = _newton(flat, query, cell, local, corner_transforms, places, size, tolerance, max_steps)
+            width = max(queries.shape[1], 1)
+            roots.query = (first + roots.query // width) * count + start + roots.query % width
+            roots.cell = cells[roots.cell % max(len(cells), 1)]
             parts.append(drop_duplicates(roots, _SAME_ROOT * float(size.min())))
     if not parts:
-        return _newton(points.reshape(-1, 3), cells[:0], cells[:0], transforms.new_empty(0, 8, 12), origins, size, 0.0, 0)
+        nothing = cells[:0], cells[:0], points.new_empty(0, 3)
+        return _newton(points.reshape(-1, 3), *nothing, transforms.new_empty(0, 8, 12), origins, size, 0.0, 0)
     return Roots.concatenate(parts)
 
 
@@ -85,54 +98,68 @@ def posed_cell_boxes(corner_transforms: Tensor, origins: Tensor, cell_size: Tens
         origins: canonical position of each cell's first corner, [C, 3], metres.
         cell_size: [3], metres.
     """
-    rows = corner_transforms.reshape(-1, 8, 3, 4)
-    start = (rows[..., :3] * origins[:, None, None]).sum(-1) + rows[..., 3]
-    reach = rows[..., :3] * cell_size
-    return (start + reach.clamp(max=0).sum(-1)).amin(1), (start + reach.clamp(min=0).sum(-1)).amax(1)
+    start, sides = _images(corner_transforms, origins, cell_size)
+    return (start + sides.clamp(max=0).sum(-1)).amin(1), (start + sides.clamp(min=0).sum(-1)).amax(1)
+
+
+def _images(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where the transform of each corner takes the cell's first corner, [C, 8, 3], and its sides, [C, 8, 3, 3].
+
+    Column i of the sides is the image of the cell's side along axis i.
+    """
+    rows = corner_transforms.reshape(len(corner_transforms), 24, 4)
+    homogeneous = torch.cat([origins, torch.ones_like(origins[:, :1])], 1)
+    start = torch.bmm(rows, homogeneous[:, :, None]).reshape(-1, 8, 3)
+    return start, rows.reshape(-1, 8, 3, 4)[..., :3] * cell_size
 
 
 def _candidates(points: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """Return all pairs (query [P], cell [P]) where the query lies in the cell's posed box, cell by cell.
+    """Return all pairs (query [P], cell [P]) of the same pose where the query lies in the cell's posed box, cell by cell.
 
     The queries are sorted into uniform bins, x fastest, so that a run of bins along x is one contiguous range of queries.
+
+    Args:
+        points: queries [G, N, 3] of G poses; numbered g * N + n in the result.
+        lower, upper: boxes [G * C, 3] of C cells in each pose; numbered g * C + c in the result.
     """
-    device = points.device
-    known = points.isfinite().all(1).nonzero()[:, 0]
+    poses, count = points.shape[:2]
+    flat = points.reshape(-1, 3)
     boxed = (lower.isfinite() & upper.isfinite()).all(1)
-    if not len(known) or not bool(boxed.any()):
-        nothing = torch.empty(0, dtype=torch.long, device=device)
+    if not len(flat) or not bool(boxed.any()):
+        nothing = torch.empty(0, dtype=torch.long, device=points.device)
         return nothing, nothing
-    finite = points[known]
-    # Queries beyond every box need no bin of their own.
-    near = ((finite >= lower[boxed].amin(0)) & (finite <= upper[boxed].amax(0))).all(1)
-    known, finite = known[near], finite[near]
+    # Queries beyond every box need no bin of their own, and non-finite ones compare false.
+    known = ((flat >= lower[boxed].amin(0)) & (flat <= upper[boxed].amax(0))).all(1).nonzero()[:, 0]
     if not len(known):
         return known, known
-    first, last = finite.amin(0), finite.amax(0)
+    near = flat[known]
+    first, last = near.amin(0), near.amax(0)
     side = max(float((last - first).max()) / _BINS_PER_SIDE, float((upper - lower)[boxed].mean()), 1e-9)
     bins = ((last - first) / side).long() + 1
-    index = ((finite - first) / side).long().minimum(bins - 1)
-    key = (index[:, 2] * bins[1] + index[:, 1]) * bins[0] + index[:, 0]
+    place = ((near - first) / side).long().minimum(bins - 1)
+    pose = known // count
+    key = ((pose * bins[2] + place[:, 2]) * bins[1] + place[:, 1]) * bins[0] + place[:, 0]
     order = torch.argsort(key, stable=True)
-    sorted_points, known = finite[order], known[order]
-    begin = torch.zeros(int(bins.prod()) + 1, dtype=torch.long, device=device)
-    begin[1:] = torch.bincount(key, minlength=int(bins.prod())).cumsum(0)
+    near, known = near[order], known[order]
+    begin = torch.zeros(poses * int(bins.prod()) + 1, dtype=torch.long, device=points.device)
+    begin[1:] = torch.bincount(key, minlength=len(begin) - 1).cumsum(0)
 
     touched = (boxed & (upper >= first).all(1) & (lower <= last).all(1)).nonzero()[:, 0]
-    low = ((lower[touched] - first) / side).clamp_min(0).long()
+    low = ((lower[touched] - first) / side).clamp_min(0).long().minimum(bins - 1)
     high = ((upper[touched] - first) / side).clamp_min(0).long().minimum(bins - 1)
-    low = low.minimum(bins - 1)
     rows = high[:, 1:] - low[:, 1:] + 1
     owner, nth = _expand(rows.prod(1))
     y = low[owner, 1] + nth % rows[owner, 0]
     z = low[owner, 2] + nth // rows[owner, 0]
-    row = (z * bins[1] + y) * bins[0]
+    cells_per_pose = len(lower) // poses
+    row = ((touched[owner] // cells_per_pose * bins[2] + z) * bins[1] + y) * bins[0]
     row_begin, row_end = begin[row + low[owner, 0]], begin[row + high[owner, 0] + 1]
     range_owner, nth = _expand(row_end - row_begin)
     at = row_begin[range_owner] + nth
     cell = touched[owner[range_owner]]
-    query_points = sorted_points[at]
-    inside = ((query_points >= lower[cell]) & (query_points <= upper[cell])).all(1).nonzero()[:, 0]
+    candidates = near.index_select(0, at)
+    above, below = candidates >= lower.index_select(0, cell), candidates <= upper.index_select(0, cell)
+    inside = (above & below).all(1).nonzero()[:, 0]
     return known[at[inside]], cell[inside]
 
 
@@ -142,25 +169,58 @@ def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
     return owner, torch.arange(len(owner), device=counts.device) - (counts.cumsum(0) - counts)[owner]
 
 
+def _centres(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what the first Newton step in each cell needs.
+
+    Returns:
+        Posed centres [C, 3], metres; inverse Jacobians [C, 3, 3] there, to cell coordinates; and how far from the centre, in
+        cell coordinates, that step may lead and the cell still hold a root, [C].
+    """
+    middle = torch.full_like(origins, 0.5)
+    posed, jacobian = forward_jacobian(corner_transforms, middle, origins, cell_size)
+    inverse, _ = invert_3x3(jacobian)
+    start, sides = _images(corner_transforms, origins, cell_size)
+    offsets = CORNERS.to(cell_size)
+    posed_corners = start + (sides * offsets[:, None]).sum(-1)
+    linear = torch.bmm(posed_corners - posed[:, None], inverse.transpose(1, 2)) + 0.5
+    deviation = (linear - offsets).abs().amax((1, 2))
+    reach = 0.5 + _CURVED * deviation + _SLACK
+    return posed, inverse, torch.where(reach.isfinite(), reach, torch.inf)
+
+
+def _first_step(
+    points: Tensor, query: Tensor, cell: Tensor, centres: Tensor, inverse: Tensor, reach: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Take Newton's step from the centre for each pair; return the pairs that may be roots and where it led, [P, 3]."""
+    offset = points.index_select(0, query) - centres.index_select(0, cell)
+    step = torch.bmm(inverse.index_select(0, cell), offset[:, :, None])[:, :, 0].nan_to_num(0, 0, 0)
+    possible = (step.abs().amax(1) <= reach[cell]).nonzero()[:, 0]
+    return query[possible], cell[possible], 0.5 + step[possible].clamp(-0.75, 0.75)
+
+
 def _newton(
     points: Tensor,
     query: Tensor,
     cell: Tensor,
+    local: Tensor,
     corner_transforms: Tensor,
     origins: Tensor,
     cell_size: Tensor,
     tolerance: float,
     max_steps: int,
 ) -> Roots:
-    """Run Newton's method for each pair of query and cell (SNARF Eq. 6 with the exact Jacobian); keep roots in the cell."""
+    """Run Newton's method from `local` for each pair of query and cell; keep roots in the cell.
+
+    Source: SNARF Eq. 6, with the exact Jacobian.
+    """
     reach = 0.5 + _FACE_TOLERANCE[points.dtype]
-    local = points.new_full((len(query), 3), 0.5)
     found = [(query[:0], cell[:0], local[:0], points.new_empty(0, 3, 3))]
     for _ in range(max_steps):
         if not len(query):
             break
-        posed, jacobian = forward_jacobian(corner_transforms[cell], local, origins[cell], cell_size)
-        residual = posed - points[query]
+        corners = corner_transforms.index_select(0, cell)
+        posed, jacobian = forward_jacobian(corners, local, origins.index_select(0, cell), cell_size)
+        residual = posed - points.index_select(0, query)
         inverse, _ = invert_3x3(jacobian)
         step = torch.bmm(inverse, residual[:, :, None])[:, :, 0]
         longest = step.abs().amax(1, keepdim=True)
@@ -168,10 +228,11 @@ def _newton(
         # A last, tiny step polishes a converged root; beside a fold, where it is not tiny, the point stays where it is.
         trusted = (~converged)[:, None] | (longest < _POLISH)
         local = torch.where(trusted, local - step / longest.clamp_min(1), local)
-        in_cell = ((local - 0.5).abs() <= reach).all(1)
-        done = (converged & in_cell).nonzero()[:, 0]
+        from_centre = (local - 0.5).abs().amax(1)
+        done = (converged & (from_centre <= reach)).nonzero()[:, 0]
         found.append((query[done], cell[done], local[done], inverse[done] * cell_size[:, None]))
-        going = (~converged & ((local - 0.5).abs() < _STRAY).all(1)).nonzero()[:, 0]
-        query, cell, local = query[going], cell[going], local[going]
+        # Steps grow shorter towards a root: one that ends farther outside the cell than it was long will not come back.
+        going = (~converged & (from_centre - 0.5 < longest[:, 0].clamp_max(_STRAY))).nonzero()[:, 0]
+        query, cell, local = (pairs.index_select(0, going) for pairs in (query, cell, local))
     query, cell, local, inverse = (torch.cat(parts) for parts in zip(*found, strict=True))
     return Roots(origins[cell] + local * cell_size, query, inverse, cell, local)

@@ -55,12 +55,13 @@ class Roots:
 def invert_3x3(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Return inverses [M, 3, 3] and determinants [M] of 3x3 matrices; a singular matrix gives infinities or NaN.
 
-    Cofactors by cross products: many times faster than a batched LU factorisation, and never in reduced precision.
+    Written out: many times faster than a batched LU factorisation, and never in reduced precision.
     """
-    a, b, c = matrix.unbind(1)
-    cofactors = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], 2)
-    determinant = (a * cofactors[:, :, 0]).sum(1)
-    return cofactors / determinant[:, None, None], determinant
+    a, b, c, d, e, f, g, h, i = matrix.reshape(-1, 9).unbind(1)
+    first, second, third = e * i - f * h, f * g - d * i, d * h - e * g
+    determinant = a * first + b * second + c * third
+    adjugate = [first, c * h - b * i, b * f - c * e, second, a * i - c * g, c * d - a * f, third, b * g - a * h, a * e - b * d]
+    return (torch.stack(adjugate, 1) / determinant[:, None]).reshape(-1, 3, 3), determinant
 
 
 def drop_duplicates(roots: Roots, distance: float) -> Roots:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_gradients, trilinear_weights
+from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
 
 __all__ = ["blend_transforms", "forward_jacobian", "interpolate", "skin"]
 
@@ -71,9 +71,21 @@ def forward_jacobian(corner_transforms: Tensor, local: Tensor, origin: Tensor, c
 
     Source: SNARF Eq. 4 with T(x) trilinear (Fast-SNARF Sec. 4.1); product rule for the Jacobian.
     """
-    phi = torch.cat([trilinear_weights(local)[:, None], trilinear_gradients(local)], 1)
-    blended = torch.bmm(phi, corner_transforms).reshape(-1, 4, 3, 4)
-    canonical = origin + local * cell_size
-    moved = (blended[..., :3] * canonical[:, None, None]).sum(-1) + blended[..., 3]  # T x, then dT/du_i x
-    jacobian = moved[:, 1:].transpose(1, 2) + blended[:, 0, :, :3] * cell_size
+    # Interpolate along z, then y, then x, and carry the differences along: a fifth of the time of products with the
+    # trilinear weights and their derivatives (benchmarks/bm_training.py).
+    u, v, w = (coordinate[:, None, None] for coordinate in local.unbind(1))
+    by_w = corner_transforms[:, 4:] - corner_transforms[:, :4]
+    at_w = torch.addcmul(corner_transforms[:, :4], by_w, w)
+    by_v = at_w[:, 2:] - at_w[:, :2]
+    at_v = torch.addcmul(at_w[:, :2], by_v, v)
+    by_w = torch.lerp(by_w[:, :2], by_w[:, 2:], v)
+    by_u = at_v[:, 1] - at_v[:, 0]
+    u = u[:, 0]
+    blended = torch.addcmul(at_v[:, 0], by_u, u)
+    by_v, by_w = torch.lerp(by_v[:, 0], by_v[:, 1], u), torch.lerp(by_w[:, 0], by_w[:, 1], u)
+    canonical = torch.addcmul(origin, local, cell_size)
+    homogeneous = torch.cat([canonical, torch.ones_like(canonical[:, :1])], 1)
+    stacked = torch.stack([blended, by_u, by_v, by_w], 1).reshape(-1, 12, 4)
+    moved = torch.bmm(stacked, homogeneous[:, :, None]).reshape(-1, 4, 3)  # T x, then dT/du_i x
+    jacobian = moved[:, 1:].transpose(1, 2) + blended.reshape(-1, 3, 4)[:, :, :3] * cell_size
     return moved[:, 0], jacobian

@@ -87,7 +87,7 @@ def test_broyden_roots_are_among_the_complete_ones():
         for root, query in zip(broyden.canonical, broyden.query, strict=True)
     ]
     assert len(known) > 250
-    assert sum(known) >= 0.99 * len(known)  # the rest are second roots in a fold's cell
+    assert sum(known) >= 0.98 * len(known)  # the rest are second roots in a fold's cell
     few = find_correspondences(points[None], transforms, weights, grid, search="broyden", init_bones=[0])
     assert len(few.query) < len(broyden.query)
 

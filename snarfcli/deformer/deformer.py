@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from snarfcli.deformer.complete import posed_cell_boxes
 from snarfcli.deformer.correspondences import Correspondences, find_correspondences
-from snarfcli.deformer.grid import CanonicalGrid, cell_corners
+from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
 from snarfcli.deformer.search import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, interpolate, skin
 from snarfcli.deformer.weights import DistilledWeights
@@ -127,6 +127,11 @@ class ForwardDeformer(nn.Module):
             divergence=self.search.divergence,
             jacobian=self.search.jacobian,
         )
+
+    def is_active(self, canonical: Tensor) -> Tensor:
+        """Return which canonical points [N, 3] lie in cells that a complete search looks into, bool [N]."""
+        cell, local = locate(canonical, self.grid, self.shape)
+        return ((local >= 0) & (local <= 1)).all(1) & self.active_cells.reshape(-1)[cell]
 
     def posed_box(self, bone_transforms: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
         """Return the corners (lower [3], upper [3]) of a box around the images of `cells` in one pose, metres.

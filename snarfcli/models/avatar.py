@@ -13,10 +13,11 @@ from torch import Tensor
 
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid
+from snarfcli.deformer.grid import locate
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path
 from snarfcli.models.extent import bone_segments
-from snarfcli.models.fast_snarf import AvatarConfig, FastSnarf, FieldSamples
+from snarfcli.models.fast_snarf import NO_CORRESPONDENCE, AvatarConfig, FastSnarf, FieldSamples
 
 if TYPE_CHECKING:
     from snarfcli.meshing.mesh import Mesh
@@ -26,6 +27,7 @@ __all__ = ["Avatar", "load_checkpoint"]
 FORMAT = "snarf-avatar"
 FORMAT_VERSION = 1
 _MODELS = {"fast_snarf": FastSnarf}
+_THINNEST_PART_M = 0.02  # spacing at which the canonical shape is looked for, about a finger
 
 
 class Avatar:
@@ -134,10 +136,15 @@ class Avatar:
 
     @torch.no_grad()
     def canonical_logits(self, canonical: Tensor, pose: Tensor) -> Tensor:
-        """Return occupancy logits [N] at canonical points [N, 3] for the shape of one pose [J, 3]."""
+        """Return occupancy logits [N] at canonical points [N, 3] for the shape of one pose [J, 3].
+
+        Where the search never looks the network was never trained; there it is `NO_CORRESPONDENCE`.
+        """
+        canonical = canonical.to(self.device)
+        searched = self.model.deformer.is_active(canonical).nonzero()[:, 0]
         condition = self.model.condition(pose[None].to(self.device))
-        index = torch.zeros(len(canonical), dtype=torch.long, device=self.device)
-        return self.model.canonical_logits(canonical.to(self.device), condition, index)
+        values = self.model.canonical_logits(canonical[searched], condition, torch.zeros_like(searched))
+        return canonical.new_full((len(canonical),), NO_CORRESPONDENCE).index_copy(0, searched, values)
 
     @torch.no_grad()
     def skinning_weights(self, canonical: Tensor) -> Tensor:
@@ -166,11 +173,14 @@ class Avatar:
     def _cells_of_body(self) -> Tensor:
         """Return which grid cells the canonical shape touches in the canonical pose, or neighbours, bool [D-1, H-1, W-1]."""
         deformer = self.model.deformer
-        nodes = deformer.grid.nodes(deformer.shape).reshape(-1, 3)
-        logits = self.canonical_logits(nodes, self.skeleton.canonical_pose.float()).reshape(1, 1, *deformer.shape)
-        corners = torch.nn.functional.max_pool3d(logits, 2, stride=1)
-        # One cell further, since thin parts may lie between the nodes and the pose moves the surface a little.
-        touched = (torch.nn.functional.max_pool3d(corners, 3, stride=1, padding=1)[0, 0] > 0) & deformer.active_cells
+        finer = (deformer.grid.cell_size(deformer.shape) / _THINNEST_PART_M).ceil().long().tolist()
+        shape = [(n - 1) * factor + 1 for n, factor in zip(deformer.shape, reversed(finer), strict=True)]
+        points = deformer.grid.nodes(shape).reshape(-1, 3)
+        inside = points[self.canonical_logits(points, self.skeleton.canonical_pose.float()) > 0]
+        touched = torch.zeros_like(deformer.active_cells)
+        touched.view(-1)[locate(inside, deformer.grid, deformer.shape)[0]] = True
+        # One cell further, since the pose moves the surface a little.
+        touched = torch.nn.functional.max_pool3d(touched[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
         return touched if bool(touched.any()) else deformer.active_cells
 
     def mesh(

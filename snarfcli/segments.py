@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = ["distance_to_segments"]
+__all__ = ["distance_to_segments", "segment_distances"]
 
 
-def distance_to_segments(points: Tensor, segments: Tensor) -> Tensor:
-    """Return the distance of points [N, 3] to the nearest of the segments [S, 2, 3] (start, end), [N], metres."""
+def segment_distances(points: Tensor, segments: Tensor) -> Tensor:
+    """Return the distance of points [N, 3] to each of the segments [S, 2, 3] (start, end), [N, S], metres.
+
+    A segment may be a point.
+    """
     start = segments[:, 0]
     along = segments[:, 1] - start
     length = (along * along).sum(1).clamp_min(1e-12)
@@ -17,4 +20,9 @@ def distance_to_segments(points: Tensor, segments: Tensor) -> Tensor:
     share = (from_start / length).clamp(0, 1)
     to_start = (points * points).sum(1, keepdim=True) - 2 * points @ start.T + (start * start).sum(1)
     squared = to_start - 2 * share * from_start + share * share * length
-    return squared.amin(1).clamp_min(1e-12).sqrt()
+    return squared.clamp_min(1e-12).sqrt()
+
+
+def distance_to_segments(points: Tensor, segments: Tensor) -> Tensor:
+    """Return the distance of points [N, 3] to the nearest of the segments [S, 2, 3], [N], metres."""
+    return segment_distances(points, segments).amin(1)

@@ -8,8 +8,10 @@ from snarfcli.deformer.deformer import ForwardDeformer, SkinningConfig, cells_ne
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.search import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, skin
+from snarfcli.deformer.weights import BonePrior
 
 __all__ = [
+    "BonePrior",
     "CanonicalGrid",
     "Correspondences",
     "ForwardDeformer",

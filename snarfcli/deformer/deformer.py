@@ -12,7 +12,7 @@ from snarfcli.deformer.correspondences import Correspondences, find_corresponden
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
 from snarfcli.deformer.search import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, interpolate, skin
-from snarfcli.deformer.weights import DistilledWeights
+from snarfcli.deformer.weights import BonePrior, DistilledWeights
 from snarfcli.segments import distance_to_segments
 
 __all__ = ["ForwardDeformer", "SkinningConfig", "cells_near"]
@@ -38,6 +38,8 @@ class SkinningConfig:
     """Factor before the softmax over the bones."""
     weight_norm: bool = True
     """Whether the network's layers are weight-normalised."""
+    prior_falloff_m: float | None = None
+    """The network corrects weights that fall by a factor e over this distance to a bone, metres; null for no such prior."""
 
 
 class ForwardDeformer(nn.Module):
@@ -49,6 +51,7 @@ class ForwardDeformer(nn.Module):
         skinning: the weight field.
         search: how correspondences are found.
         active_cells: bool [D-1, H-1, W-1], the cells that a complete search looks into (see `cells_near`); None for all.
+        prior: weights that the field only corrects.
     """
 
     def __init__(
@@ -58,6 +61,7 @@ class ForwardDeformer(nn.Module):
         skinning: SkinningConfig | None = None,
         search: SearchConfig | None = None,
         active_cells: Tensor | None = None,
+        prior: BonePrior | None = None,
     ) -> None:
         super().__init__()
         skinning = skinning or SkinningConfig()
@@ -66,7 +70,7 @@ class ForwardDeformer(nn.Module):
         width, height, depth = skinning.resolution
         self.shape = (depth, height, width)
         self.field = DistilledWeights(
-            num_bones, grid, skinning.width, skinning.depth, skinning.sharpness, skinning.weight_norm
+            num_bones, grid, skinning.width, skinning.depth, skinning.sharpness, skinning.weight_norm, prior
         )
         self.register_buffer("lower", grid.lower.clone())
         self.register_buffer("upper", grid.upper.clone())

@@ -16,7 +16,6 @@ from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.grid import locate
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path
-from snarfcli.models.extent import bone_segments
 from snarfcli.models.fast_snarf import NO_CORRESPONDENCE, AvatarConfig, FastSnarf, FieldSamples
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ class Avatar:
         self.skeleton = skeleton
         self.facts = dict(facts or {})
         surface = skeleton.canonical_joints if surface is None else surface
-        self.model = _MODELS[config.model.name](config, bone_segments(skeleton), skeleton.num_joints, grid, surface)
+        self.model = _MODELS[config.model.name](config, skeleton, grid, surface)
         self._body_cells: Tensor | None = None
 
     # ---------------------------------------------------------------- files

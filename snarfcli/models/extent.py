@@ -7,13 +7,23 @@ from torch import Tensor
 
 from snarfcli.bodies import Skeleton
 
-__all__ = ["bone_segments", "unpose_by_nearest_bone"]
+__all__ = ["bone_segments", "unpose_by_nearest_bone", "weight_segments"]
 
 
 def bone_segments(skeleton: Skeleton, joints: Tensor | None = None) -> Tensor:
     """Return the ends (parent, child) of the bones, [S, 2, 3], metres, in the canonical frame unless `joints` are given."""
     joints = skeleton.canonical_joints if joints is None else joints
     return torch.stack([torch.stack([joints[parent], joints[child]]) for parent, child in skeleton.bones])
+
+
+def weight_segments(skeleton: Skeleton) -> tuple[Tensor, list[int]]:
+    """Return the segments [S, 2, 3] that move with each joint, canonical frame, metres, and their joints, S numbers.
+
+    A joint moves the segments to its children; a last joint, which has none, the point where it is.
+    """
+    joints = skeleton.canonical_joints
+    pairs = skeleton.bones + [(leaf, leaf) for leaf in _leaves(skeleton)]
+    return torch.stack([torch.stack([joints[start], joints[end]]) for start, end in pairs]), [start for start, _ in pairs]
 
 
 def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: Skeleton) -> Tensor:
@@ -28,8 +38,7 @@ def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: 
         [V, 3], canonical frame, metres; wrong by a few centimetres near bent joints.
     """
     joints = skeleton.canonical_joints.to(vertices)
-    parents = {parent for parent, _ in skeleton.bones}
-    leaves = [(joint, joint) for joint in range(skeleton.num_joints) if joint not in parents]
+    leaves = [(joint, joint) for joint in _leaves(skeleton)]
     # What lies beyond a last joint (fingers, toes, skull) is as near to that joint as to the end of its parent's bone.
     pairs = torch.tensor(leaves + skeleton.bones)
     ends, moved = joints[pairs], bone_transforms[pairs[:, 0]]
@@ -42,3 +51,8 @@ def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: 
     nearest = distance.argmin(1)
     inverse = torch.linalg.inv(moved)[nearest]
     return (inverse[:, :3, :3] @ vertices[:, :, None])[:, :, 0] + inverse[:, :3, 3]
+
+
+def _leaves(skeleton: Skeleton) -> list[int]:
+    """Return the joints without children."""
+    return sorted(set(range(skeleton.num_joints)) - {parent for parent, _ in skeleton.bones})

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from snarfcli.bodies import Skeleton
 from snarfcli.deformer import (
+    BonePrior,
     CanonicalGrid,
     Correspondences,
     ForwardDeformer,
@@ -16,6 +18,7 @@ from snarfcli.deformer import (
     SkinningConfig,
     cells_near,
 )
+from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.precision import matmul_precision
 from snarfcli.shape import OccupancyNetwork, ShapeConfig
 
@@ -69,25 +72,26 @@ class FastSnarf(nn.Module):
 
     Args:
         config: architecture.
-        bones: canonical ends of the bones, [S, 2, 3], metres.
-        num_bones: J.
+        skeleton: joint tree and canonical pose.
         grid: canonical box of the skinning weights.
         surface: rough canonical surface points, [K, 3], metres; with the bones they say where to search.
     """
 
-    def __init__(self, config: AvatarConfig, bones: Tensor, num_bones: int, grid: CanonicalGrid, surface: Tensor) -> None:
+    def __init__(self, config: AvatarConfig, skeleton: Skeleton, grid: CanonicalGrid, surface: Tensor) -> None:
         super().__init__()
         if config.model.blend not in ("logit", "probability"):
             raise ValueError(f"model.blend must be logit or probability, got {config.model.blend!r}")
         self.config = config
-        skinning = config.skinning
-        active = None
+        skinning, bones, num_bones = config.skinning, bone_segments(skeleton), skeleton.num_joints
+        active = prior = None
         if skinning.bone_radius_m is not None:
             width, height, depth = skinning.resolution
             points = surface[:, None].expand(-1, 2, -1)
             places = [(bones, skinning.bone_radius_m), (points, skinning.surface_radius_m)]
             active = cells_near(grid, (depth, height, width), places)
-        self.deformer = ForwardDeformer(grid, num_bones, skinning, config.search, active)
+        if skinning.prior_falloff_m is not None:
+            prior = BonePrior(*weight_segments(skeleton), num_bones, skinning.prior_falloff_m)
+        self.deformer = ForwardDeformer(grid, num_bones, skinning, config.search, active, prior)
         self.shape = OccupancyNetwork(config.shape, 3 * (num_bones - 1), bones)
 
     def condition(self, pose: Tensor) -> Tensor:

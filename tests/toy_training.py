@@ -29,14 +29,14 @@ def toy_store(root: Path, points: int = 800, frames: int = 34) -> SampleStore:
     return SampleStore.open(root, "builtin", "toy")
 
 
-def avatar_config(**search: object) -> AvatarConfig:
-    """Return networks of a size that trains in seconds."""
+def avatar_config(*, capsules: bool = False, **search: object) -> AvatarConfig:
+    """Return networks of a size that trains in seconds; with `capsules` the shape starts as one around the only bone."""
     skinning = SkinningConfig(
-        resolution=[16, 12, 8], margin_m=[0.05, 0.05, 0.05], width=32, depth=2, weight_norm=False
+        resolution=[16, 12, 8], margin_m=[0.05, 0.05, 0.05], width=32, depth=2, weight_norm=False, prior_falloff_m=0.03
     )
     shape = ShapeConfig(
         width=32, depth=3, activation="relu", skip_layers=[], frequencies=[4.0], condition_layer=2, condition_size=4,
-        condition_at_start=False, geometric_init=False, weight_norm=False, prior_radius_m=0.07,
+        condition_at_start=False, geometric_init=not capsules, weight_norm=False, prior_radius_m=0.07 if capsules else None,
     )  # fmt: skip
     return AvatarConfig(ModelConfig(), skinning, SearchConfig(**search), shape)
 
@@ -44,7 +44,7 @@ def avatar_config(**search: object) -> AvatarConfig:
 def training_config(**changes: object) -> TrainingConfig:
     """Return settings of a short training."""
     config = TrainingConfig(
-        name="toy", steps=150, poses_per_step=3, uniform_points=200, surface_points=200, learning_rate=5e-3,
+        name="toy", steps=150, poses_per_step=3, uniform_points=200, surface_points=200, learning_rate=1e-2,
         final_learning_rate=0.05, warmup_steps=5, average_decay=0.95, bootstrap_steps=50, bone_occupancy_weight=0.1,
         bone_points=5, joint_weight=1.0, joint_target="halves", precision="highest", autocast=False, validate_every=75,
         validation_frames=2, checkpoint_every=50,

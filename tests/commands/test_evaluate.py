@@ -30,7 +30,7 @@ def store(tmp_path_factory) -> SampleStore:
 def toy_avatar(store: SampleStore, subject: str = "toy") -> Avatar:
     """Return an untrained avatar: the capsule prior fills its one bone, and the other half of the body is missing."""
     torch.manual_seed(0)
-    avatar = new_avatar(store)
+    avatar = new_avatar(store, avatar_config(capsules=True))
     avatar.facts = {"data": "builtin", "subject": subject, "steps": 0, "loss": float("nan")}
     return avatar
 
@@ -159,7 +159,7 @@ def test_an_avatar_of_another_skeleton_is_refused(config, store):
         joints_rest=joints,
         canonical_pose=torch.zeros(3, 3),
     )
-    Avatar(avatar_config(), longer, toy_avatar(store).model.deformer.grid).save(folder_of(config) / "avatar.pt")
+    Avatar(avatar_config(capsules=True), longer, toy_avatar(store).model.deformer.grid).save(folder_of(config) / "avatar.pt")
     with pytest.raises(UserError, match="the avatar has 3 joints and the samples of subject toy have 2"):
         run(config)
 

@@ -90,16 +90,18 @@ class Trainer:
 
     def _bootstrap_losses(self, pose: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return the losses that fill the bones and tie the joints to their bones (SNARF Sec. 3.3)."""
-        generator = torch.Generator().manual_seed(int(np.random.default_rng([self.seed, self.step, 1]).integers(2**62)))
-        points = points_on_bones(self.bones, self.config.bone_points, generator)
-        index = torch.arange(len(points), device=self.device) % len(pose)
-        logits = self.model.canonical_logits(points, self.model.condition(pose), index, self.config.precision)
-        weights = self.model.deformer.field(self.joints)
-        return {
-            "bone_occupancy": self.config.bone_occupancy_weight
-            * F.binary_cross_entropy_with_logits(logits.float(), torch.ones_like(logits)),
-            "joint_weight": self.config.joint_weight * F.mse_loss(weights, self.joint_targets),
-        }
+        losses = {}
+        if self.config.bone_occupancy_weight > 0:
+            generator = torch.Generator().manual_seed(int(np.random.default_rng([self.seed, self.step, 1]).integers(2**62)))
+            points = points_on_bones(self.bones, self.config.bone_points, generator)
+            index = torch.arange(len(points), device=self.device) % len(pose)
+            logits = self.model.canonical_logits(points, self.model.condition(pose), index, self.config.precision).float()
+            entropy = F.binary_cross_entropy_with_logits(logits, torch.ones_like(logits))
+            losses["bone_occupancy"] = self.config.bone_occupancy_weight * entropy
+        if self.config.joint_weight > 0:
+            weights = self.model.deformer.field(self.joints)
+            losses["joint_weight"] = self.config.joint_weight * F.mse_loss(weights, self.joint_targets)
+        return losses
 
     @torch.no_grad()
     def _update_average(self) -> None:

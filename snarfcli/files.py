@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import secrets
@@ -16,7 +17,7 @@ import numpy as np
 
 from snarfcli.errors import UserError
 
-__all__ = ["atomic_path", "read_json", "read_npz", "write_json"]
+__all__ = ["atomic_path", "read_json", "read_npz", "write_json", "write_tensors"]
 
 
 @contextmanager
@@ -24,6 +25,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path` that replaces it when the block succeeds and vanishes when it fails.
 
     Parent folders are made. The temporary name keeps the suffix, since many writers choose the format by it.
+
+    Raises:
+        OSError: the file cannot be written; it names `path`, which the system does not do for a full disk.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -31,6 +35,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, str(temporary)):
+            error.filename = str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -39,6 +47,20 @@ def write_json(path: str | Path, content: Any) -> None:
     """Write `content` as indented JSON, whole or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def write_tensors(path: str | Path, content: Any) -> None:
+    """Write `content` by `torch.save`, whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written. (`torch.save` by itself reports a full disk as a RuntimeError without a reason.)
+    """
+    import torch
+
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def read_json(path: str | Path, what: str = "file") -> Any:
@@ -59,21 +81,28 @@ def read_npz(path: str | Path, what: str = "file") -> dict[str, np.ndarray]:
     """Read every array of an `.npz` file without ever unpickling anything.
 
     Raises:
-        UserError: the file is missing, is not a zip archive, is truncated, or holds pickled objects.
+        UserError: the file is missing, cannot be opened, is not a zip archive, is truncated, or holds pickled objects.
     """
     path = Path(path)
     if path.is_dir():
         raise UserError(f"{what} {path} is a folder; name an .npz file")
     if not path.exists():
         raise UserError(f"no {what} at {path}")
-    if not zipfile.is_zipfile(path):
+    try:
+        with path.open("rb") as file:
+            is_archive = zipfile.is_zipfile(file)
+    except OSError as error:
+        raise UserError(f"{what} {path} cannot be opened ({error.strerror or error})") from None
+    if not is_archive:
         raise UserError(f"{what} {path} is not an .npz archive, or is truncated; copy or download it again")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
+            arrays = {key: archive[key] for key in archive.files}
+            return {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}  # others come as bytes
     except ValueError as error:
         if "allow_pickle" in str(error):
             raise UserError(f"{what} {path} holds pickled objects, which are never executed; save plain arrays") from None
         raise UserError(f"{what} {path} cannot be read ({error}); copy or download it again") from None
-    except (zipfile.BadZipFile, EOFError, OSError, KeyError, zlib.error) as error:
+    except (zipfile.BadZipFile, EOFError, OSError, KeyError, zlib.error, RuntimeError, MemoryError) as error:
+        # RuntimeError: encrypted, or compressed in a way that this Python cannot read. MemoryError: an absurd shape.
         raise UserError(f"{what} {path} is damaged ({error}); copy or download it again") from None

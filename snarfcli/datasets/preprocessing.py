@@ -111,7 +111,7 @@ def preprocess_subject(
             manifest = write_manifest(folder, header, entries)
         except BaseException as error:
             remove_leftovers(folder)
-            if isinstance(error, OSError) and error.filename is None:
+            if isinstance(error, OSError) and error.errno is not None and error.filename is None:
                 error.filename = str(folder)  # a write to a full disk does not say where
             raise
     _report(manifest, sum(entry["frames"] for entry in made), sampling.points_per_frame, seconds)

@@ -198,7 +198,10 @@ class SampleStore:
             raise UserError(f"no samples of subject {subject} under {folder.parent}; {command}")
         manifest = read_json(folder / "manifest.json", "manifest of the samples")
         check_format(manifest, folder)
-        return cls(folder, manifest)
+        try:
+            return cls(folder, manifest)
+        except (KeyError, TypeError) as error:
+            raise UserError(f"the samples are damaged: {folder} lacks {error} or has it otherwise; {_again(folder)}") from None
 
     def sequences(self, split: str) -> list[SequenceSamples]:
         """Return the sequences of one split, in the order of the data set.

@@ -19,7 +19,14 @@ __all__ = ["choose_device", "find_avatar", "machine_facts", "run_folder", "seed_
 
 
 def run_folder(output_root: str, data: str, subject: str, run: str) -> Path:
-    """Return the folder of one run: `<output_root>/<data>/<subject>/<run>`."""
+    """Return the folder of one run: `<output_root>/<data>/<subject>/<run>`.
+
+    Raises:
+        UserError: a name is empty or leads elsewhere; a run may be replaced as a whole, so it must have a folder of its own.
+    """
+    for name, value in (("data.name", data), ("subject", str(subject)), ("run", run)):
+        if value in ("", ".", "..") or any(separator in value for separator in "/\\:"):
+            raise UserError(f"{name} must be the name of a folder, without / \\ and :, got '{value}'")
     return Path(output_root) / data / str(subject) / run
 
 

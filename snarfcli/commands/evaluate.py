@@ -10,11 +10,12 @@ from pathlib import Path
 
 from omegaconf import MISSING
 
+from snarfcli.checks import check_choice, check_number, check_search
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.store import SampleStore, samples_folder
 from snarfcli.datasets.subjects import builtin_subject
 from snarfcli.deformer import SearchConfig
-from snarfcli.errors import UserError, nearest
+from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import evaluate
 from snarfcli.evaluation.report import SPLITS, Evaluation, metrics_content, table, timings_text
 from snarfcli.files import write_json
@@ -26,7 +27,6 @@ __all__ = ["EvalConfig", "run"]
 log = logging.getLogger(__name__)
 
 _STORE_SPLITS = {"id": "test", "ood": "ood"}
-_SEARCHES = ("complete", "broyden")
 
 
 @dataclass
@@ -137,20 +137,14 @@ def run(config: EvalConfig) -> None:
 
 def _check(config: EvalConfig) -> None:
     """Refuse settings that cannot be used, before any work starts."""
-    if config.split not in SPLITS:
-        raise UserError(f"split must be id or ood, got '{config.split}'{nearest(config.split, SPLITS)}")
-    for name, least in (("max_frames", 1), ("points", 2), ("figure_frames", 1), ("figure_resolution", 16)):
-        value = getattr(config, name)
-        if value is not None and value < least:
-            raise UserError(f"{name} must be at least {least}, got {value}")
+    check_choice("split", config.split, SPLITS)
+    for name, least in (("max_frames", 1), ("points", 2), ("figure_frames", 1), ("figure_resolution", 16), ("seed", 0)):
+        check_number(name, getattr(config, name), least)
+    if config.search is not None:
+        check_search(config.search)
     samples = samples_folder(config.data_root, config.data.name, config.subject)
     if config.data.name == "builtin" and not samples.exists():
         builtin_subject(config.subject)  # says so, and which name is near, if there is no such subject
-    if config.search is not None and config.search.name not in _SEARCHES:
-        name = config.search.name
-        raise UserError(f"search.name must be {' or '.join(_SEARCHES)}, got '{name}'{nearest(name, _SEARCHES)}")
-    if config.search is not None and config.search.name == "complete" and config.search.init_bones is not None:
-        raise UserError("search.init_bones is for search=broyden; the complete search has no start bones")
 
 
 def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from omegaconf import MISSING, OmegaConf
 
+from snarfcli.checks import check_choice, check_number, check_search
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.store import SampleStore
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
@@ -19,16 +20,24 @@ from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
 from snarfcli.models.avatar import Avatar, load_checkpoint
 from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
+from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.shape import ShapeConfig
 from snarfcli.training.extent import rough_canonical_surface
 from snarfcli.training.loop import train
+from snarfcli.training.losses import JOINT_TARGETS
 from snarfcli.training.settings import TrainingConfig
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Trainer
 
 __all__ = ["TrainConfig", "new_trainer", "run"]
 
 log = logging.getLogger(__name__)
+
+_AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every")
+_NOT_NEGATIVE = (
+    "uniform_points", "surface_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight", "joint_weight",
+    "validation_frames",
+)  # fmt: skip
 
 
 @dataclass
@@ -68,7 +77,13 @@ class TrainConfig:
 
 
 def run(config: TrainConfig) -> None:
-    """Train one subject and write the run folder: avatar, checkpoint, metrics, configuration, TensorBoard events."""
+    """Train one subject and write the run folder: avatar, checkpoint, metrics, configuration, TensorBoard events.
+
+    Raises:
+        UserError: there are no samples, a setting cannot be used, or the folder holds a run that these settings do not go with.
+        OSError: the folder cannot be written to, or the disk is full.
+    """
+    _check(config)
     folder = run_folder(config.output_root, config.data.name, config.subject, config.run)
     checkpoint = folder / "checkpoint.pt"
     started = checkpoint.exists() or (folder / "avatar.pt").exists()
@@ -85,7 +100,10 @@ def run(config: TrainConfig) -> None:
     frames = sum(len(sequence.train_frames) for sequence in sequences)
     log.info("data: %s, subject %s, %d sequences, %d frames to train on", store.data, store.subject, len(sequences), frames)
 
-    trainer = new_trainer(config, store, device)
+    try:
+        trainer = new_trainer(config, store, device)
+    except ValueError as error:  # networks and grids name the setting that they cannot use
+        raise UserError(str(error)) from error
     if config.resume and checkpoint.exists():
         state = load_checkpoint(checkpoint, CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
         trainer.restore(state, str(checkpoint))
@@ -118,6 +136,35 @@ def run(config: TrainConfig) -> None:
             100 * validation["iou_surface"],
         )
     log.info("avatar: %s", folder / "avatar.pt")
+
+
+def _check(config: TrainConfig) -> None:
+    """Refuse settings that cannot be used, before any work starts."""
+    training = config.training
+    for name in _AT_LEAST_ONE:
+        check_number(f"training.{name}", getattr(training, name), 1)
+    for name in _NOT_NEGATIVE:
+        check_number(f"training.{name}", getattr(training, name), 0)
+    if training.uniform_points + training.surface_points == 0:
+        raise UserError("training.uniform_points and training.surface_points are both 0; nothing could be learned")
+    check_number("training.learning_rate", training.learning_rate, 0, 1)
+    check_number("training.final_learning_rate", training.final_learning_rate, 0, 1)
+    check_number("training.average_decay", training.average_decay, 0, 1)
+    check_choice("training.precision", training.precision, PRECISIONS)
+    check_choice("training.joint_target", training.joint_target, JOINT_TARGETS)
+    check_choice("skinning.name", config.skinning.name, ("distilled",))
+    check_choice("shape.name", config.shape.name, ("mlp",))
+    for name, least in (("resolution", 2), ("margin_m", 0)):
+        values = getattr(config.skinning, name)
+        if len(values) != 3:
+            raise UserError(f"skinning.{name} must be three numbers, along x, y and z, got {values}")
+        for value in values:
+            check_number(f"skinning.{name}", value, least)
+    for group in ("skinning", "shape"):
+        for name in ("width", "depth"):
+            check_number(f"{group}.{name}", getattr(getattr(config, group), name), 1)
+    check_search(config.search)
+    check_number("seed", config.seed, 0)
 
 
 def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -> Trainer:

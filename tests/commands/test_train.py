@@ -1,0 +1,132 @@
+"""`snarf train` end to end on a bending capsule: the run folder, resumption, and what is never overwritten unasked."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from toy_training import avatar_config, toy_store, training_config
+
+from snarfcli.commands.train import TrainConfig, run
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.store import SampleStore
+from snarfcli.errors import UserError
+from snarfcli.models.avatar import Avatar
+from snarfcli.training.trainer import Trainer
+
+FILES = {"avatar.pt", "checkpoint.pt", "config.yaml", "metrics.json", "tensorboard"}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> SampleStore:
+    return toy_store(tmp_path_factory.mktemp("data"), points=400, frames=12)
+
+
+@pytest.fixture
+def config(store: SampleStore, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> TrainConfig:
+    caplog.set_level(logging.INFO, "snarfcli")
+    parts = avatar_config()
+    return TrainConfig(
+        subject="toy",
+        data=DataConfig("builtin", 1, 1, 1),
+        model=parts.model,
+        skinning=parts.skinning,
+        search=parts.search,
+        shape=parts.shape,
+        training=training_config(steps=6, validate_every=3, checkpoint_every=4, bootstrap_steps=3),
+        data_root=str(store.folder.parents[2]),
+        output_root=str(tmp_path / "outputs"),
+        run="mine",
+        resume=False,
+        overwrite=False,
+        device="cpu",
+        threads=None,
+        seed=0,
+    )
+
+
+def folder_of(config: TrainConfig) -> Path:
+    return Path(config.output_root) / "builtin" / "toy" / config.run
+
+
+def test_the_run_folder_holds_all_that_a_run_should(config, caplog):
+    run(config)
+    folder = folder_of(config)
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert any((folder / "tensorboard").iterdir())
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert {name: metrics[name] for name in ("data", "subject", "model", "split", "steps", "seed")} == {
+        "data": "builtin", "subject": "toy", "model": "fast_snarf", "split": "validation", "steps": 6, "seed": 0,
+    }  # fmt: skip
+    assert 0 <= metrics["iou_surface"] <= 1 and metrics["timings"]["points_per_second"] > 0
+    assert {"versions", "machine"} <= set(metrics)
+    assert "steps: 6" in (folder / "config.yaml").read_text()
+    assert Avatar.load(folder / "avatar.pt").facts["steps"] == 6
+    assert "data: builtin, subject toy, 1 sequences, 11 frames to train on" in caplog.text
+    assert "points/s" in caplog.text and "validation (held-back motion): IoU bbox" in caplog.text
+
+
+def test_an_interrupted_run_resumes_to_the_same_avatar(config, monkeypatch, caplog):
+    whole = replace(config, run="whole")
+    run(whole)
+    advance = Trainer.advance
+
+    def interrupted(self):
+        numbers = advance(self)
+        if self.step == 5:
+            raise KeyboardInterrupt
+        return numbers
+
+    monkeypatch.setattr(Trainer, "advance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(config)
+    assert "continue with resume=true" in caplog.text
+    assert {path.name for path in folder_of(config).iterdir()} == FILES - {"avatar.pt", "metrics.json"}
+    monkeypatch.setattr(Trainer, "advance", advance)
+    with pytest.raises(UserError, match="already holds a run; give resume=true to continue it, overwrite=true"):
+        run(config)
+    torch.manual_seed(99)
+    run(replace(config, resume=True))
+    assert "resuming at step 4 of 6" in caplog.text
+    mine, theirs = (Avatar.load(folder_of(c) / "avatar.pt").model.state_dict() for c in (config, whole))
+    assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
+
+    before = (folder_of(config) / "avatar.pt").read_bytes()
+    run(replace(config, resume=True))
+    assert "already trained" in caplog.text and (folder_of(config) / "avatar.pt").read_bytes() == before
+    with pytest.raises(UserError, match=r"made with other settings \(seed: 0 there, 1 here\)"):
+        run(replace(config, resume=True, seed=1))
+    run(replace(config, overwrite=True, seed=1))
+    assert (folder_of(config) / "avatar.pt").read_bytes() != before
+
+
+def test_a_damaged_checkpoint_is_named_and_left(config):
+    folder_of(config).mkdir(parents=True)
+    path = folder_of(config) / "checkpoint.pt"
+    path.write_bytes(b"half of a checkpoint")
+    with pytest.raises(UserError, match="checkpoint.*is truncated or is not a file of snarf"):
+        run(replace(config, resume=True))
+    assert [file.name for file in folder_of(config).iterdir()] == ["checkpoint.pt"]
+
+
+@pytest.mark.parametrize(
+    ("group", "changes", "message"),
+    [
+        ("model", {"name": "slow_snarf"}, "model.name must be one of fast_snarf, got 'slow_snarf'"),
+        ("model", {"blend": "mean"}, "model.blend must be logit or probability, got 'mean'"),
+        ("shape", {"activation": "tanh"}, "shape.activation must be"),
+        ("shape", {"depth": 0}, "shape.depth must be at least 1, got 0"),
+        ("training", {"poses_per_step": 0}, "training.poses_per_step must be at least 1"),
+        ("training", {"uniform_points": 0, "surface_points": 0}, "nothing could be learned"),
+        ("training", {"joint_target": "own_"}, "training.joint_target must be halves or parent or own, .* did you mean 'own'"),
+        ("training", {"learning_rate": float("nan")}, "training.learning_rate must be between"),
+    ],
+)
+def test_settings_that_cannot_be_used_make_nothing(config, group, changes, message):
+    with pytest.raises(UserError, match=message):
+        run(replace(config, **{group: replace(getattr(config, group), **changes)}))
+    assert not Path(config.output_root).exists()

@@ -14,9 +14,10 @@ from typing import Any
 import torch
 from omegaconf import MISSING
 
+from snarfcli.checks import check_choice, check_number
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.subjects import BUILTIN_SUBJECTS, builtin_subject
-from snarfcli.errors import UserError, nearest
+from snarfcli.errors import UserError
 from snarfcli.export.animation import Animation
 from snarfcli.export.meshes import MESH_WRITERS
 from snarfcli.export.stage import set_stage
@@ -36,7 +37,8 @@ log = logging.getLogger(__name__)
 
 _RECORD = "animation.json"
 _VIDEO = "video.mp4"
-_LEAST_RESOLUTION = 16
+_RESOLUTIONS = (16, 1024)  # dense lattices: 1024 take some 4 GB for a body with its arms spread
+_FRAME_RATES = (1.0, 1000.0)
 _LARGEST_PICTURE = 4096
 
 
@@ -75,7 +77,7 @@ class AnimateConfig:
     surface: str = MISSING
     """field (the union, watertight) or skinned (the canonical mesh moved by its skin)."""
     resolution: int = MISSING
-    """Voxels along the longest side: 128, 256, 512 or any number from 16."""
+    """Voxels along the longest side: 128, 256, 512 or any number from 16 to 1024."""
     keep_share: float = MISSING
     """Loose pieces with fewer faces than this share of the largest surface's are dropped."""
     meshes: bool = MISSING
@@ -170,19 +172,14 @@ def run(config: AnimateConfig) -> int:
 def _check(config: AnimateConfig) -> tuple[int, int]:
     """Refuse settings that cannot be used, before any work starts; return the size of the video."""
     for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("up", ("auto", "y", "z"))):
-        value = getattr(config, name)
-        if value not in choices:
-            raise UserError(f"{name} must be {' or '.join(choices)}, got '{value}'{nearest(value, choices)}")
-    for name, least in (("resolution", _LEAST_RESOLUTION), ("step", 1), ("max_frames", 1)):
-        value = getattr(config, name)
-        if value is not None and value < least:
-            raise UserError(f"{name} must be at least {least}, got {value}")
-    if not 0 <= config.keep_share <= 1:
-        raise UserError(f"keep_share must be between 0 and 1, got {config.keep_share}")
-    if not config.motion_frame_rate > 0:
-        raise UserError(f"motion_frame_rate must be positive, got {config.motion_frame_rate}")
-    if not abs(config.elevation_deg) < 90:
-        raise UserError(f"elevation_deg must be between -90 and 90, got {config.elevation_deg}")
+        check_choice(name, getattr(config, name), choices)
+    for name, least in (("step", 1), ("max_frames", 1), ("motion_seed", 0)):
+        check_number(name, getattr(config, name), least)
+    check_number("resolution", config.resolution, *_RESOLUTIONS)
+    check_number("keep_share", config.keep_share, 0, 1)
+    check_number("motion_frame_rate", config.motion_frame_rate, *_FRAME_RATES)
+    check_number("azimuth_deg", config.azimuth_deg, -360, 360)
+    check_number("elevation_deg", config.elevation_deg, -89, 89)
     if not (config.meshes or config.video):
         raise UserError("nothing to make: both meshes and video are false")
     size = re.fullmatch(r"\s*(\d+)(?:\s*x\s*(\d+))?\s*", config.video_size)
@@ -240,7 +237,12 @@ def _settings(config: AnimateConfig, avatar: Path, motion: Motion, numbers: list
 def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
     """Make the folder ready: keep frames of the same settings, refuse others, or start again."""
     record = folder / _RECORD
-    old = None if overwrite or not record.exists() else read_json(record, "record of an animation").get("settings", {})
+    old = None
+    if record.exists() and not overwrite:
+        content = read_json(record, "record of an animation")
+        old = content.get("settings") if isinstance(content, dict) else None
+        if not isinstance(old, dict):
+            raise UserError(f"{record} is no record of an animation; give overwrite=true to replace it, or output=FOLDER")
     if old is not None:
         changed = [name for name, value in settings.items() if old.get(name) != value]
         if changed:
@@ -248,13 +250,20 @@ def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
             what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
             raise UserError(f"{folder} holds frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
     else:
-        for stale in [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), folder / _VIDEO]:
+        there = [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), *folder.glob(_VIDEO)]
+        if there and not overwrite:  # without a record they are somebody else's
+            raise UserError(
+                f"{folder} holds {there[0].name} of unknown origin; give overwrite=true to replace it, or output=FOLDER"
+            )
+        for stale in there:
             stale.unlink(missing_ok=True)
     write_json(record, {"complete": False, "settings": settings})
 
 
 def _canonical(config: AnimateConfig, avatar: Avatar, motion: Motion) -> Mesh | None:
-    """Return the canonical body in the first pose, for colours and for the camera; None if it has no surface."""
+    """Return the canonical body in the first pose, for colours and camera; None without need or if it has no surface."""
+    if not (config.video or config.weight_colors):
+        return None
     resolution = min(128, config.resolution) if config.weight_colors else min(64, config.resolution)
     try:
         return canonical_surface(avatar, torch.from_numpy(motion.poses[0]).float(), resolution)

@@ -179,6 +179,20 @@ def test_other_settings_are_refused_and_overwrite_starts_again(config):
     assert run(replace(short, output=str(folder_of(config).parent / "elsewhere"))) == 0
 
 
+def test_files_of_others_are_not_deleted(config, tmp_path):
+    mine = tmp_path / "mine" / "frame_0001.ply"
+    mine.parent.mkdir()
+    mine.write_text("not by this program")
+    short = replace(config, max_frames=1, video=False, output=str(mine.parent))
+    with pytest.raises(UserError, match="holds frame_0001.ply of unknown origin; give overwrite=true"):
+        run(short)
+    assert mine.exists()
+    (mine.parent / "animation.json").write_text("[]")
+    with pytest.raises(UserError, match="is no record of an animation"):
+        run(short)
+    assert run(replace(short, overwrite=True)) == 0 and not mine.exists()
+
+
 def test_a_frame_without_surface_is_reported_and_the_rest_goes_on(config, toy, monkeypatch, caplog):
     query = toy.query
 
@@ -212,7 +226,7 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"surface": "feild"}, "surface must be field or skinned, got 'feild'; did you mean 'field'"),
         ({"format": "stl"}, "format must be ply or obj, got 'stl'"),
         ({"up": "x"}, "up must be auto or y or z"),
-        ({"resolution": 15}, "resolution must be at least 16, got 15"),
+        ({"resolution": 15}, "resolution must be between 16 and 1024, got 15"),
         ({"keep_share": 1.5}, "keep_share must be between 0 and 1, got 1.5"),
         ({"step": 0}, "step must be at least 1"),
         ({"max_frames": 0}, "max_frames must be at least 1"),
@@ -221,7 +235,9 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"video_size": "large"}, "video_size must be a number such as 512 or 1280x720"),
         ({"video_size": "9000"}, "video_size must be"),
         ({"elevation_deg": 90.0}, "elevation_deg must be between"),
-        ({"pose": None, "motion_frame_rate": 0.0}, "motion_frame_rate must be positive"),
+        ({"pose": None, "motion_frame_rate": 0.0}, "motion_frame_rate must be between"),
+        ({"azimuth_deg": float("nan")}, "azimuth_deg must be between"),
+        ({"pose": None, "motion_seed": -1}, "motion_seed must be at least 0"),
         ({"pose": None}, "motion jumping_jacks has 24 joints, the avatar has 2"),
         ({"pose": None, "motion": "jumping_jaks"}, "did you mean 'jumping_jacks'"),
         ({"pose": "nowhere.npz"}, "no pose file at nowhere.npz"),

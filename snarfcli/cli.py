@@ -160,8 +160,12 @@ def _run(command: Command, arguments: list[str]) -> int:
 
 
 def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
-    """Replace the command's flags by overrides; refuse unknown flags and words that are no override."""
+    """Replace the command's flags by overrides; refuse unknown flags and words that are no override.
+
+    Hydra's own flags come last: its parser reads overrides in one run only, not before and after a flag.
+    """
     out: list[str] = []
+    flags: list[str] = []
     rest = list(arguments)
     while rest:
         argument = rest.pop(0)
@@ -178,17 +182,17 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
                 raise UserError(f"{name} takes no value, got {argument!r}")
             out.append(override)
         elif name in _HYDRA_FLAGS:
-            out.append(argument)
+            flags.append(argument)
             if name in ("--cfg", "-c", "--package", "-p", "--info", "-i") and not equals and rest and "=" not in rest[0]:
-                out.append(rest.pop(0))
+                flags.append(rest.pop(0))
         elif argument.startswith("-"):
             valid = [*command.flags, "--help", *_HYDRA_FLAGS]
             raise UserError(f"unknown flag {argument!r}{nearest(argument, valid)}; see \"snarf {command.name} --help\"")
-        elif not equals and not argument.startswith("~"):
+        elif not equals or argument.startswith("~"):
             raise UserError(f"{argument!r} is no setting; write name=value; see \"snarf {command.name} --help\"")
         else:
             out.append(argument)
-    return out
+    return out + flags
 
 
 def _quote(value: str) -> str:
@@ -253,7 +257,7 @@ def _file_message(error: OSError) -> str:
         errno.EISDIR: "is a folder, not a file",
         errno.ENOENT: "is not there",
     }
-    return f"{name}: {advice.get(error.errno or 0, error.strerror or str(error))}"
+    return f"{name}: {advice.get(error.errno or 0, error.strerror or _one_line(error))}"
 
 
 def _config_message(chain: list[BaseException]) -> str:

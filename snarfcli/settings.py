@@ -88,10 +88,12 @@ def check_overrides(overrides: Sequence[str], schema: type) -> None:
             raise UserError(f"{key} needs a choice of {group} with it, such as {group}={group_options(group)[0]}")
         if key in groups:
             options = group_options(key)
-            for option in _values(override):
-                if str(option) not in options:
-                    near = nearest(str(option), options)
-                    raise UserError(f"there is no {key}={option}{near}; choose from {', '.join(options)}")
+            left_out = ", or leave it out" if type(None) in typing.get_args(hints[key]) else ""
+            for value in _values(override):
+                option = "null" if value is None else str(value)
+                if option not in options:
+                    near = nearest(option, options)
+                    raise UserError(f"there is no {key}={option}{near}; choose from {', '.join(options)}{left_out}")
 
 
 def _values(override: Any) -> list[Any]:

@@ -73,6 +73,14 @@ WRONG = {
     ("train", "training.steps=many"): "training.steps wants a whole number, got 'many'",
     ("train", "resume=perhaps"): "'perhaps' is not a valid bool",
     ("train", "--resum"): "unknown flag '--resum'; did you mean '--resume'?",
+    ("train", "~subject"): "'~subject' is no setting",
+    ("train", "run=../.."): "run must be the name of a folder",
+    ("train", "seed=-1"): "seed must be at least 0, got -1",
+    ("train", "training.validate_every=0"): "training.validate_every must be at least 1, got 0",
+    ("train", "training.precision=half"): "training.precision must be highest or high or medium, got 'half'",
+    ("train", "skinning.resolution=[8,8]"): "skinning.resolution must be three numbers, along x, y and z, got [8, 8]",
+    ("train", "search.jacobian=exat"): "search.jacobian must be exact or broyden, got 'exat'; did you mean 'exact'?",
+    ("eval", "search=null"): "there is no search=null; choose from broyden, complete, or leave it out",
     ("train", "50002"): "'50002' is no setting; write name=value",
     ("train", "subject='unclosed"): "cannot read \"subject='unclosed\"",
     ("train", "device=gpu"): "device must be auto, cpu, cuda or cuda:N, got 'gpu'",
@@ -109,9 +117,16 @@ def test_file_names_with_any_characters_pass_through_flags():
 
 def test_overrides_and_flags_keep_their_order():
     command = cli.COMMANDS["eval"]
-    assert cli._translate_flags(command, ["subject=1", "--ood", "-m", "--cfg", "job"]) == [
+    assert cli._translate_flags(command, ["subject=1", "-m", "--ood", "--cfg", "job"]) == [
         "subject=1", "split=ood", "-m", "--cfg", "job",
     ]  # fmt: skip
+
+
+def test_flags_of_hydra_may_stand_anywhere(capsys):
+    code, out, _ = run(capsys, "train", "--cfg", "job", "subject=7", "--package", "training", "training=smoke")
+    assert code == 0 and "name: smoke" in out
+    code, _, err = run(capsys, "preprocess", "-m", "subject=1,2", "workers=1")
+    assert code == 2 and "no built-in subject '1'" in err
 
 
 def test_unwritable_and_full_folders_are_named():

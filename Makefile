@@ -15,7 +15,7 @@ help:
 	@echo "make test    run the tests"
 	@echo "make lint    check the style of the code"
 	@echo "make bench   measure a training step, evaluation and mesh extraction"
-	@echo "make clean   remove $(VENV), samples and results"
+	@echo "make clean   remove .venv, samples and results"
 
 setup: $(INSTALLED)
 

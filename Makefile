@@ -25,7 +25,7 @@ $(INSTALLED): pyproject.toml tools/set_up.sh
 demo: $(INSTALLED)
 	$(SNARF) preprocess subject=$(SUBJECT)
 	$(SNARF) train subject=$(SUBJECT) training=quick run=demo resume=true
-	$(SNARF) animate subject=$(SUBJECT) run=demo resolution=128 max_frames=30
+	$(SNARF) animate subject=$(SUBJECT) run=demo resolution=128 max_frames=30 overwrite=true
 	$(SNARF) eval subject=$(SUBJECT) run=demo
 	$(SNARF) eval --ood subject=$(SUBJECT) run=demo
 	@echo "avatar, tables and pictures: outputs/builtin/$(SUBJECT)/demo"

@@ -31,11 +31,10 @@ def measure(name: str, search: str, store: SampleStore, steps: int, repeats: int
     parts: dict[str, list[float]] = {"search": [], "shape": []}
 
     def forward():
-        with torch.autocast("cpu", torch.bfloat16, enabled=trainer.config.autocast):
-            field = trainer.model(batch.points, batch.bone_transforms, batch.pose, trainer.config.precision)
+        field = trainer.model(batch.points, batch.bone_transforms, batch.pose, trainer.config.precision)
         parts["search"].append(field.search_s)
         parts["shape"].append(field.shape_s)
-        return occupancy_loss(field.logits.float(), batch.occupied, field.found)
+        return occupancy_loss(field.logits, batch.occupied, field.found)
 
     def forward_and_backward():
         loss = forward()

@@ -104,7 +104,7 @@ def run(config: TrainConfig) -> None:
         trainer = new_trainer(config, store, device)
     except ValueError as error:  # networks and grids name the setting that they cannot use
         raise UserError(str(error)) from error
-    if config.resume and checkpoint.exists():
+    if config.resume and started:
         state = load_checkpoint(checkpoint, CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
         trainer.restore(state, str(checkpoint))
         if trainer.step >= config.training.steps and (folder / "avatar.pt").exists():

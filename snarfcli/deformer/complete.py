@@ -1,14 +1,15 @@
-"""Complete correspondence search: every root of d(x) = x' in the grid, cell by cell.
+"""Complete correspondence search: the roots of d(x) = x' in the grid, cell by cell.
 
 Inside one cell T(x) is a convex combination of the eight corner transforms T_k, so d(cell) lies inside the box spanned by
 T_k [x; 1] over the corners k and the x of the cell. The queries inside that box are the only ones that can have a root in the
 cell. The first step of Newton's method from the cell's centre needs nothing but the centre's value and inverse Jacobian,
-which all queries of a cell share; where it leads too far out of the cell for how curved the field is in it, there is no root.
-What remains, hardly more than the roots, is solved with the exact Jacobian of the trilinear field. No start bones, nothing to
-tune, and a query outside all boxes is known to have no correspondence at all.
+which all queries of a cell share; where it leads too far out of the cell for how curved the field is in it, the pair is
+dropped. What remains, hardly more than the roots, is solved with the exact Jacobian of the trilinear field. No start
+bones, nothing to tune, and a query outside all boxes is known to have no correspondence at all.
 
-This is the readable version in PyTorch. A cell in which the determinant of the Jacobian changes sign may hold several roots
-for one query; one start finds one of them.
+This is the readable version in PyTorch. Two things may be missed: a second root of the same query in one cell, where the
+determinant of the Jacobian changes sign and one start is not enough; and a root in a cell more curved between its corners than
+_CURVED and _SLACK allow for. tests/deformer/test_search.py compares with an exhaustive search.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from snarfcli.deformer.complete import complete_roots
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, trilinear_weights
 from snarfcli.deformer.search import Roots
 from snarfcli.deformer.skinning import blend_transforms
+from snarfcli.precision import matmul_precision
 
 __all__ = ["Correspondences", "find_correspondences"]
 
@@ -108,9 +109,10 @@ def find_correspondences(
     grid = grid.to(points)
     depth, height, width = skinning_weights.shape[:3]
     shape = (depth, height, width)
-    transforms = blend_transforms(skinning_weights, bone_transforms)
     length = grid.longest_side
-    with torch.no_grad():
+    with matmul_precision("highest"):
+        transforms = blend_transforms(skinning_weights, bone_transforms)
+    with torch.no_grad(), matmul_precision("highest"):
         if search == "complete":
             roots = complete_roots(
                 points.detach(),
@@ -165,7 +167,8 @@ class _ImplicitRoots(torch.autograd.Function):
     def backward(ctx, gradient):
         canonical, jacobian_inverse, query, nodes, local = ctx.saved_tensors
         points_shape, transforms_shape = ctx.shapes
-        pulled = torch.bmm(jacobian_inverse.transpose(1, 2), gradient[:, :, None])
+        with matmul_precision("highest"):
+            pulled = torch.bmm(jacobian_inverse.transpose(1, 2), gradient[:, :, None])
         v_points = v_transforms = None
         if ctx.needs_input_grad[0]:
             v_points = gradient.new_zeros(points_shape[0] * points_shape[1], 3)

@@ -169,7 +169,7 @@ def cells_near(grid: CanonicalGrid, shape: tuple[int, int, int], places: list[tu
             of no length.
     """
     nodes = grid.nodes(shape).reshape(-1, 3)
-    near = torch.zeros(len(nodes), dtype=torch.bool)
+    near = torch.zeros(len(nodes), dtype=torch.bool, device=nodes.device)
     for segments, radius in places:
         for some in segments.split(256):  # bounds the memory
             near |= distance_to_segments(nodes, some) < radius

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["CORNERS", "CanonicalGrid", "cell_corners", "locate", "trilinear_gradients", "trilinear_weights"]
+__all__ = ["CORNERS", "CanonicalGrid", "cell_corners", "locate", "trilinear_weights"]
 
 # Corner k of a cell lies at (k & 1, k >> 1 & 1, k >> 2 & 1) along (x, y, z).
 CORNERS = torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])
@@ -92,13 +92,3 @@ def trilinear_weights(local: Tensor) -> Tensor:
     x0, y0, z0 = 1 - x, 1 - y, 1 - z
     xy = torch.stack([x0 * y0, x * y0, x0 * y, x * y], -1)
     return torch.cat([xy * z0[..., None], xy * z[..., None]], -1)
-
-
-def trilinear_gradients(local: Tensor) -> Tensor:
-    """Return the derivatives [..., 3, 8] of `trilinear_weights` by the coordinates in the cell."""
-    x, y, z = local.unbind(-1)
-    x0, y0, z0 = 1 - x, 1 - y, 1 - z
-    by_x = torch.stack([-y0 * z0, y0 * z0, -y * z0, y * z0, -y0 * z, y0 * z, -y * z, y * z], -1)
-    by_y = torch.stack([-x0 * z0, -x * z0, x0 * z0, x * z0, -x0 * z, -x * z, x0 * z, x * z], -1)
-    by_z = torch.stack([-x0 * y0, -x * y0, -x0 * y, -x * y, x0 * y0, x * y0, x0 * y, x * y], -1)
-    return torch.stack([by_x, by_y, by_z], -2)

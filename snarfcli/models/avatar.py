@@ -15,7 +15,7 @@ from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.grid import locate
 from snarfcli.errors import UserError
-from snarfcli.files import atomic_path
+from snarfcli.files import write_tensors
 from snarfcli.models.fast_snarf import NO_CORRESPONDENCE, AvatarConfig, FastSnarf, FieldSamples
 
 if TYPE_CHECKING:
@@ -60,8 +60,7 @@ class Avatar:
     # ---------------------------------------------------------------- files
     def save(self, path: str | Path) -> None:
         """Write the avatar to one file, whole or not at all; `torch.load(weights_only=True)` reads it."""
-        with atomic_path(path) as temporary:
-            torch.save(self.to_dict(), temporary)
+        write_tensors(path, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain dicts, lists, numbers and tensors that describe the avatar completely."""
@@ -92,7 +91,7 @@ class Avatar:
             grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
             avatar = cls(config, Skeleton.from_dict(content["skeleton"]), grid, facts=content["facts"])
             avatar.model.load_state_dict(content["state"])
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OmegaConfBaseException) as error:
+        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OmegaConfBaseException) as error:
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise UserError(f"{path} does not describe an avatar of this version ({reason}); train it again") from None
         avatar.model.eval()

@@ -19,7 +19,7 @@ from snarfcli.deformer import (
     cells_near,
 )
 from snarfcli.models.extent import bone_segments, weight_segments
-from snarfcli.precision import matmul_precision
+from snarfcli.precision import network_precision
 from snarfcli.shape import OccupancyNetwork, ShapeConfig
 
 __all__ = ["AvatarConfig", "FastSnarf", "FieldSamples", "ModelConfig", "NO_CORRESPONDENCE", "blend"]
@@ -107,7 +107,7 @@ class FastSnarf(nn.Module):
             points: [B, N, 3], posed space, metres.
             bone_transforms: [B, J, 4, 4], canonical to posed.
             pose: [B, J, 3] axis-angle, radians.
-            precision: of the matrix products in the shape network; the search always runs in full float32.
+            precision: of the shape network (see `PRECISIONS`); the search always runs in full float32.
 
         Source: SNARF Eq. 9.
         """
@@ -122,11 +122,11 @@ class FastSnarf(nn.Module):
 
     def canonical_logits(self, canonical: Tensor, condition: Tensor, pose: Tensor, precision: str = "highest") -> Tensor:
         """Return the canonical occupancy logits [M] of points [M, 3] under `condition[pose]` ([B, C] and [M])."""
-        with matmul_precision(precision):
+        with network_precision(precision, canonical.device):
             if torch.is_grad_enabled():
-                return self.shape(canonical, condition, pose)
+                return self.shape(canonical, condition, pose).to(canonical.dtype)
             chunks = zip(canonical.split(_POINTS_AT_ONCE), pose.split(_POINTS_AT_ONCE), strict=True)
-            return torch.cat([self.shape(points, condition, index) for points, index in chunks])
+            return torch.cat([self.shape(points, condition, index) for points, index in chunks]).to(canonical.dtype)
 
 
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:

@@ -12,9 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from snarfcli.files import atomic_path
+from snarfcli.files import write_tensors
 from snarfcli.training.trainer import Trainer
 
 __all__ = ["train"]
@@ -38,16 +36,11 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
         The last validation and the speed of this part of the run.
     """
     config = trainer.config
-    checkpoint = folder / "checkpoint.pt"
     first_step, start, reported = trainer.step, time.monotonic(), 0.0
     recent: list[dict[str, float]] = []
     validation: dict[str, float] = {}
     points_per_step = config.poses_per_step * (config.uniform_points + config.surface_points)
     paused = 0.0
-
-    def save() -> None:
-        with atomic_path(checkpoint) as temporary:
-            torch.save(trainer.state(), temporary)
 
     with _interrupt_between_steps() as interrupted, _bar(config.steps, first_step) as bar:
         while trainer.step < config.steps:
@@ -64,7 +57,7 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
                 on_scalars(step, {f"validation_{name}": value for name, value in validation.items()})
                 paused += time.monotonic() - before
             if interrupted.is_set() or step % config.checkpoint_every == 0 or last:
-                save()
+                write_tensors(folder / "checkpoint.pt", trainer.state())
             if interrupted.is_set():
                 raise KeyboardInterrupt
             line = _line(recent, validation, speed * points_per_step)
@@ -77,6 +70,7 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
                 log.info("step %d of %d, %s, %.0f s left", step, config.steps, line, remaining)
     seconds = time.monotonic() - start - paused
     steps = trainer.step - first_step
+    validation = validation or trainer.validate()  # a run that was interrupted after its last step has none yet
     return {
         "validation": validation,
         "steps_this_run": steps,

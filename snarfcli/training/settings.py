@@ -40,9 +40,7 @@ class TrainingConfig:
     joint_target: str = MISSING
     """Wanted weights at a joint: halves (own bone and parent, SNARF), parent (Fast-SNARF) or own (the released code)."""
     precision: str = MISSING
-    """Float32 matrix products of the networks: highest, high or medium; the search is always in full precision."""
-    autocast: bool = MISSING
-    """Whether the shape network runs in bfloat16 where that is exact enough; the search never does."""
+    """Arithmetic of the shape network: highest, high, medium or bfloat16; the search is always in full float32."""
     validate_every: int = MISSING
     """Steps between two validations."""
     validation_frames: int = MISSING

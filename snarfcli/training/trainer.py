@@ -63,14 +63,17 @@ class Trainer:
         batch = self.batches.batch(self.step)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.autocast, cache_enabled=False):
-            field = self.model(batch.points, batch.bone_transforms, batch.pose, self.config.precision)
-        losses = {"occupancy": occupancy_loss(field.logits.float(), batch.occupied, field.found)}
+        field = self.model(batch.points, batch.bone_transforms, batch.pose, self.config.precision)
+        losses = {"occupancy": occupancy_loss(field.logits, batch.occupied, field.found)}
         if self.step < self.config.bootstrap_steps:
             losses |= self._bootstrap_losses(batch.pose)
         total = sum(losses.values())
+        if not bool(total.isfinite()):
+            raise UserError(
+                f"the loss is {total.item()} at step {self.step}; lower training.learning_rate, now {self.config.learning_rate}"
+            )
         self.optimizer.zero_grad(set_to_none=True)
-        with matmul_precision(self.config.precision):
+        with matmul_precision("medium" if self.config.precision == "bfloat16" else self.config.precision):
             total.backward()
         self.optimizer.step()
         self.step += 1
@@ -95,7 +98,7 @@ class Trainer:
             generator = torch.Generator().manual_seed(int(np.random.default_rng([self.seed, self.step, 1]).integers(2**62)))
             points = points_on_bones(self.bones, self.config.bone_points, generator)
             index = torch.arange(len(points), device=self.device) % len(pose)
-            logits = self.model.canonical_logits(points, self.model.condition(pose), index, self.config.precision).float()
+            logits = self.model.canonical_logits(points, self.model.condition(pose), index, self.config.precision)
             entropy = F.binary_cross_entropy_with_logits(logits, torch.ones_like(logits))
             losses["bone_occupancy"] = self.config.bone_occupancy_weight * entropy
         if self.config.joint_weight > 0:
@@ -159,7 +162,10 @@ class Trainer:
             UserError: the state belongs to other settings, or does not fit.
         """
         ours = self.avatar.to_dict()["config"] | {"training": asdict(self.config), "seed": self.seed}
-        theirs = state["avatar"]["config"] | {"training": state["training"], "seed": state["seed"]}
+        try:
+            theirs = state["avatar"]["config"] | {"training": state["training"], "seed": state["seed"]}
+        except (KeyError, TypeError):
+            raise UserError(f"{path} is incomplete; start again with overwrite=true") from None
         changed = _differences(theirs, ours)
         if changed:
             raise UserError(

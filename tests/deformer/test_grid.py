@@ -9,8 +9,8 @@ from scipy.interpolate import RegularGridInterpolator
 from skinning_scenes import unit_grid
 
 from snarfcli.deformer import CanonicalGrid
-from snarfcli.deformer.grid import cell_corners, locate, trilinear_gradients, trilinear_weights
-from snarfcli.deformer.skinning import interpolate
+from snarfcli.deformer.grid import cell_corners, locate, trilinear_weights
+from snarfcli.deformer.skinning import forward_jacobian, interpolate
 
 SHAPE = (3, 4, 6)
 
@@ -45,10 +45,21 @@ def test_interpolation_outside_takes_the_border():
     torch.testing.assert_close(interpolate(values, far, grid)[:, 0], torch.tensor([5.0, 0.0], dtype=torch.float64))
 
 
-def test_gradients_of_the_weights_are_their_derivatives():
-    local = torch.rand(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    wanted = torch.stack([torch.autograd.functional.jacobian(trilinear_weights, point) for point in local])
-    torch.testing.assert_close(trilinear_gradients(local), wanted.transpose(1, 2))
+def test_forward_map_and_its_jacobian_against_autograd():
+    generator = torch.Generator().manual_seed(0)
+    corners = torch.randn(5, 8, 12, generator=generator, dtype=torch.float64)
+    local = torch.rand(5, 3, generator=generator, dtype=torch.float64)
+    origin = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    size = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+
+    def posed(u):
+        blended = (trilinear_weights(u)[:, :, None] * corners).sum(1).reshape(5, 3, 4)
+        return torch.einsum("nrc,nc->nr", blended[..., :3], origin + u * size) + blended[..., 3]
+
+    value, jacobian = forward_jacobian(corners, local, origin, size)
+    wanted = torch.autograd.functional.jacobian(posed, local)
+    torch.testing.assert_close(value, posed(local))
+    torch.testing.assert_close(jacobian, torch.stack([wanted[n, :, n] for n in range(5)]))
 
 
 def test_a_box_turned_inside_out_is_refused():

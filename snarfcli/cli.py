@@ -113,11 +113,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"snarf {command.name}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except Exception as error:
-        message = _user_message(error)
-        if message is None:
-            raise
-        print(f"snarf {command.name}: {message}", file=sys.stderr)
-        return EXIT_USER_ERROR
+        return _report(command, error)
+
+
+def _report(command: Command, error: Exception) -> int:
+    """Print an error that a user can mend as one line and return its exit code; raise any other again."""
+    message = _user_message(error)
+    if message is None:
+        raise error
+    print(f"snarf {command.name}: {message}", file=sys.stderr)
+    return EXIT_USER_ERROR
 
 
 def _run(command: Command, arguments: list[str]) -> int:
@@ -131,7 +136,6 @@ def _run(command: Command, arguments: list[str]) -> int:
     check_overrides([argument for argument in overrides if not argument.startswith("-") and "=" in argument], schema)
     register_schemas(command.name, schema)
     codes: list[int] = []
-    errors: list[Exception] = []
 
     import hydra
     from omegaconf import OmegaConf
@@ -142,8 +146,8 @@ def _run(command: Command, arguments: list[str]) -> int:
             if missing:
                 raise UserError(f"no value for {', '.join(missing)}; give it as {missing[0]}=...")
             codes.append(module.run(OmegaConf.to_object(config)) or 0)
-        except Exception as error:  # Hydra would print it in its own way
-            errors.append(error)
+        except Exception as error:  # Hydra would print it in its own way; the next job of a multirun still runs
+            codes.append(_report(command, error))
 
     entry: Callable[[], None] = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=command.name)(job)
     # Hydra would print errors of the configuration in its own way and end the process; so it hands them to `main`.
@@ -154,8 +158,6 @@ def _run(command: Command, arguments: list[str]) -> int:
         entry()
     finally:
         sys.argv = before
-    if errors:
-        raise errors[0]
     return max(codes, default=0)
 
 
@@ -255,7 +257,8 @@ def _file_message(error: OSError) -> str:
         errno.EROFS: "the file system is read-only; choose another folder with output_root=... or data_root=...",
         errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
         errno.EISDIR: "is a folder, not a file",
-        errno.ENOENT: "is not there",
+        errno.EEXIST: "is a file, not a folder; choose another folder",
+        errno.ENOENT: "is not there and cannot be made; choose another folder or file",
     }
     return f"{name}: {advice.get(error.errno or 0, error.strerror or _one_line(error))}"
 
@@ -278,6 +281,7 @@ def _set_up_logging() -> None:
     """Print the program's own messages plainly on standard output."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout)
     logging.getLogger("snarfcli").setLevel(logging.INFO)
+    logging.raiseExceptions = False  # a reader that has gone, as in "| head", is no reason to print traces
 
 
 def _overview() -> str:

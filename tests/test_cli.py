@@ -77,7 +77,7 @@ WRONG = {
     ("train", "run=../.."): "run must be the name of a folder",
     ("train", "seed=-1"): "seed must be at least 0, got -1",
     ("train", "training.validate_every=0"): "training.validate_every must be at least 1, got 0",
-    ("train", "training.precision=half"): "training.precision must be highest or high or medium, got 'half'",
+    ("train", "training.precision=half"): "training.precision must be highest or high or medium or bfloat16, got 'half'",
     ("train", "skinning.resolution=[8,8]"): "skinning.resolution must be three numbers, along x, y and z, got [8, 8]",
     ("train", "search.jacobian=exat"): "search.jacobian must be exact or broyden, got 'exat'; did you mean 'exact'?",
     ("eval", "search=null"): "there is no search=null; choose from broyden, complete, or leave it out",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from snarfcli.training.settings import TrainingConfig
 
 def toy_store(root: Path, points: int = 800, frames: int = 34) -> SampleStore:
     """Make and open the samples of the toy subject under `root`."""
-    logging.getLogger("snarfcli").setLevel(logging.WARNING)
     sampling = SamplingSettings(
         points_per_frame=points, surface_noise_m=0.01, padding=0.1, inside_test="winding", seed=0
     )

@@ -122,9 +122,10 @@ def run(config: AnimateConfig) -> int:
     device = choose_device(config.device)
     set_threads(config.threads)
     avatar = Avatar.load(path, device)
-    motion, numbers = _selected(config, _read(config, avatar.skeleton.num_joints))
+    whole = _read(config, avatar.skeleton.num_joints)
+    motion, numbers = _selected(config, whole)
     folder = Path(config.output) if config.output else path.parent / "animation" / _file_name(motion.name)
-    settings = _settings(config, path, motion, numbers)
+    settings = _settings(config, path, whole, numbers)
     _prepare(folder, settings, config.overwrite)
     log.info("avatar: %s, on %s", path, device)
     log.info("motion: %s, %d frames at %g a second", motion.name, motion.num_frames, motion.frame_rate)
@@ -219,13 +220,14 @@ def _file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", name).strip(".") or "motion"
 
 
-def _settings(config: AnimateConfig, avatar: Path, motion: Motion, numbers: list[int]) -> dict[str, Any]:
+def _settings(config: AnimateConfig, avatar: Path, whole: Motion, numbers: list[int]) -> dict[str, Any]:
     """Return what the frames depend on: frames of other settings must not be mixed with them."""
-    digest = hashlib.sha256(motion.poses.tobytes() + motion.translation.tobytes())
+    digest = hashlib.sha256(whole.poses.tobytes() + whole.translation.tobytes())
     return {
         "avatar_sha256": hashlib.sha256(avatar.read_bytes()).hexdigest(),
         "motion_sha256": digest.hexdigest(),
-        "frames": [numbers[0], numbers[-1], config.step],
+        "start": numbers[0],
+        "step": config.step,
         "surface": config.surface,
         "resolution": config.resolution,
         "keep_share": config.keep_share,

@@ -85,7 +85,7 @@ def run(config: EvalConfig) -> None:
     if config.search is not None:
         avatar.model.deformer.search = config.search
     search = avatar.model.deformer.search
-    folder = path.parent / _folder_name(config)
+    folder = path.parent / _folder_name(config, avatar)
     _check_writable(folder)
     log.info(
         "data: %s, subject %s, %s: %d sequences, %d frames",
@@ -164,9 +164,16 @@ def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None
             log.warning("warning: this avatar was trained on %s %s and is evaluated on %s %s", name, trained_on, name, wanted)
 
 
-def _folder_name(config: EvalConfig) -> str:
-    """Return where the results go; another search than the trained one must not replace the avatar's own results."""
-    return f"eval_{config.split}" + (f"_{config.search.name}" if config.search is not None else "")
+def _folder_name(config: EvalConfig, avatar: Avatar) -> str:
+    """Return where the results go; those of another search, of another subject or of a part must not replace the whole."""
+    parts = ["eval", config.split]
+    if config.search is not None:
+        parts.append(config.search.name)
+    if avatar.facts.get("subject", config.subject) != config.subject:
+        parts.append(config.subject)
+    if config.max_frames is not None or config.points is not None:
+        parts.append("part")
+    return "_".join(parts)
 
 
 def _check_writable(folder: Path) -> None:

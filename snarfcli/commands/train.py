@@ -14,7 +14,8 @@ from omegaconf import MISSING, OmegaConf
 
 from snarfcli.checks import check_choice, check_number, check_search
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.store import SampleStore
+from snarfcli.datasets.store import SampleStore, samples_folder
+from snarfcli.datasets.subjects import check_subject
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
@@ -95,6 +96,8 @@ def run(config: TrainConfig) -> None:
     device = choose_device(config.device)
     set_threads(config.threads)
     seed_everything(config.seed)
+    if config.data.name == "builtin" and not samples_folder(config.data_root, "builtin", config.subject).exists():
+        check_subject(config.subject)
     store = SampleStore.open(config.data_root, config.data.name, config.subject)
     sequences = store.sequences("train")
     frames = sum(len(sequence.train_frames) for sequence in sequences)

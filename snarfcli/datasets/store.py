@@ -191,7 +191,8 @@ class SampleStore:
                 to do.
         """
         folder = samples_folder(root, data, subject)
-        command = f'run "snarf preprocess data={data} subject={subject}"'
+        elsewhere = "" if str(root) == "data" else f" data_root={root}"
+        command = f'run "snarf preprocess data={data} subject={subject}{elsewhere}"'
         if not (folder / "manifest.json").exists():
             if any(folder.glob("*/*/sequence.json")):
                 raise UserError(f"the samples of subject {subject} under {folder} are unfinished; {command} to resume")

@@ -12,7 +12,7 @@ from snarfcli.bodies import Body, Skeleton, builtin_body
 from snarfcli.errors import UserError, nearest
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, Motion, builtin_motion
 
-__all__ = ["BUILTIN_SUBJECTS", "HELD_OUT_SEQUENCES", "SequenceSpec", "SubjectData", "builtin_subject"]
+__all__ = ["BUILTIN_SUBJECTS", "HELD_OUT_SEQUENCES", "SequenceSpec", "SubjectData", "builtin_subject", "check_subject"]
 
 Split = Literal["train", "test", "ood"]
 
@@ -89,6 +89,17 @@ def _sequence_names(subject: str) -> tuple[str, ...]:
     return tuple(name for name in TRAINING_SEQUENCES if name == held_out or name in chosen)
 
 
+def check_subject(subject: str) -> None:
+    """Refuse an id that is none of `BUILTIN_SUBJECTS`, with the nearest one.
+
+    Raises:
+        UserError: it is none.
+    """
+    if subject not in HELD_OUT_SEQUENCES:
+        hint = nearest(subject, BUILTIN_SUBJECTS) or "."
+        raise UserError(f"no built-in subject '{subject}'{hint} Known are {', '.join(BUILTIN_SUBJECTS)}")
+
+
 def builtin_subject(subject: str | int) -> SubjectData:
     """Make one of the built-in subjects: always the same one for the same id.
 
@@ -99,9 +110,7 @@ def builtin_subject(subject: str | int) -> SubjectData:
         UserError: there is no such subject; the message names the nearest valid id.
     """
     subject = str(subject)
-    if subject not in HELD_OUT_SEQUENCES:
-        hint = nearest(subject, BUILTIN_SUBJECTS) or "."
-        raise UserError(f"no built-in subject '{subject}'{hint} Known are {', '.join(BUILTIN_SUBJECTS)}")
+    check_subject(subject)
     body = builtin_body()
     betas = _betas(subject, body.num_betas)
     held_out = HELD_OUT_SEQUENCES[subject]

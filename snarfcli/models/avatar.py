@@ -76,11 +76,12 @@ class Avatar:
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Avatar:
-        """Read an avatar and make it ready to use on `device`.
+        """Read an avatar from its file, or from the `avatar.pt` in a run folder, and make it ready to use on `device`.
 
         Raises:
             UserError: the file is missing, damaged, no avatar, or of another format version.
         """
+        path = Path(path) / "avatar.pt" if Path(path).is_dir() else Path(path)
         return cls.from_dict(load_checkpoint(path, FORMAT, FORMAT_VERSION, "avatar"), path).to(device)
 
     @classmethod
@@ -115,6 +116,8 @@ class Avatar:
         joints = self.skeleton.num_joints
         if pose.ndim != 3 or tuple(pose.shape[1:]) != (joints, 3):
             raise ValueError(f"pose must have shape [B, {joints}, 3], got {list(pose.shape)}")
+        if not bool(pose.isfinite().all()):
+            raise ValueError("pose must be finite, got NaN or infinite values")
         return self.skeleton.posed_from_canonical(pose, translation).to(self.device)
 
     @torch.no_grad()
@@ -201,8 +204,8 @@ class Avatar:
         surfaces = {"field": field_surface, "skinned": skinned_surface}
         if surface not in surfaces:
             raise ValueError(f"surface must be 'field' or 'skinned', got {surface!r}")
-        pose = pose.reshape(-1, 3)
-        translation = None if translation is None else translation.reshape(3)
+        pose = torch.as_tensor(pose).reshape(-1, 3)
+        translation = None if translation is None else torch.as_tensor(translation).reshape(3)
         return surfaces[surface](self, pose, translation, resolution=resolution)
 
 

@@ -169,8 +169,12 @@ def test_other_settings_are_refused_and_overwrite_starts_again(config):
     run(short)
     with pytest.raises(UserError, match=r"resolution 32 \(now 24\); give overwrite=true to replace them, or output="):
         run(replace(short, resolution=24))
-    with pytest.raises(UserError, match=r"frames \[0, 1, 1\] \(now \[0, 0, 1\]\)"):
-        run(replace(short, max_frames=1))
+    with pytest.raises(UserError, match=r"step 1 \(now 2\)"):
+        run(replace(short, step=2))
+    first = (folder_of(config) / "frame_000000.ply").stat().st_mtime_ns
+    assert run(replace(short, max_frames=3)) == 0  # a longer part of the same motion keeps what is there
+    assert (folder_of(config) / "frame_000000.ply").stat().st_mtime_ns == first
+    assert (folder_of(config) / "frame_000002.ply").exists()
     (Path(config.output_root) / "builtin" / "50002" / "fast_snarf" / "avatar.pt").write_bytes(b"trained again")
     with pytest.raises(UserError, match="frames made with another avatar"):
         run(short)

@@ -107,12 +107,12 @@ def test_metrics_say_what_was_measured(config):
 
 def test_out_of_distribution_goes_to_its_own_folder(config, caplog):
     run(replace(config, split="ood", points=100, max_frames=1))
-    metrics = read(folder_of(config) / "eval_ood")
+    metrics = read(folder_of(config) / "eval_ood_part")
     assert (metrics["split"], metrics["frames"], metrics["points_per_frame"]) == ("ood", 1, 100)
     assert list(metrics["sequences"]) == ["fold"]
     assert "out of distribution (ood)" in caplog.text
     assert "time for 200,000 points" in caplog.text
-    assert str(folder_of(config) / "eval_ood" / "metrics.json") in caplog.text
+    assert str(folder_of(config) / "eval_ood_part" / "metrics.json") in caplog.text
 
 
 def test_another_search_leaves_the_avatars_own_results(config):
@@ -127,7 +127,7 @@ def test_another_search_leaves_the_avatars_own_results(config):
 def test_results_go_beside_a_given_checkpoint(config, store, tmp_path, caplog):
     toy_avatar(store, subject="somebody").save(tmp_path / "elsewhere" / "mine.pt")
     run(replace(config, ckpt=str(tmp_path / "elsewhere" / "mine.pt")))
-    assert read(tmp_path / "elsewhere" / "eval_id")["frames"] == 3
+    assert read(tmp_path / "elsewhere" / "eval_id_toy")["frames"] == 3  # somebody's own results are another folder
     assert not (folder_of(config) / "eval_id").exists()
     assert "trained on subject somebody and is evaluated on subject toy" in caplog.text
 

@@ -132,8 +132,8 @@ def test_flags_of_hydra_may_stand_anywhere(capsys):
 def test_unwritable_and_full_folders_are_named():
     full = OSError(28, "No space left on device", "outputs/x")
     assert "outputs/x: the disk is full" in cli._user_message(full)
-    denied = PermissionError(13, "Permission denied", "/root/x")
-    assert "/root/x: no permission; choose another folder with output_root" in cli._user_message(denied)
+    denied = PermissionError(13, "Permission denied", "/locked/x")
+    assert "/locked/x: no permission; choose another folder with output_root" in cli._user_message(denied)
     assert cli._user_message(RuntimeError("a fault of the program")) is None
 
 

@@ -121,7 +121,7 @@ def run(config: TrainConfig) -> None:
     log.info("run: %s, %s parameters, %d steps on %s", folder, f"{parameters:,}", config.training.steps, device)
 
     start = time.time()
-    with _scalars(folder, trainer.step) as on_scalars:
+    with _Scalars(folder, trainer.step) as on_scalars:
         try:
             result = train(trainer, folder, on_scalars=on_scalars)
         except KeyboardInterrupt:
@@ -192,6 +192,7 @@ def _write_config(folder: Path, config: TrainConfig) -> None:
 def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seconds: float) -> dict[str, Any]:
     """Return what `metrics.json` says about the training run."""
     validation = result["validation"]
+    held_back = sum(len(sequence.val_frames) for sequence in trainer.store.sequences("train"))
     return {
         "data": config.data.name,
         "subject": config.subject,
@@ -199,7 +200,7 @@ def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seco
         "split": "validation",
         "iou_bbox": validation.get("iou_bbox"),
         "iou_surface": validation.get("iou_surface"),
-        "frames": config.training.validation_frames,
+        "frames": min(config.training.validation_frames, held_back),
         "steps": trainer.step,
         "seed": config.seed,
         "timings": {"wall_s": round(seconds, 2)} | {k: v for k, v in result.items() if k != "validation"},
@@ -208,7 +209,7 @@ def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seco
     }
 
 
-class _scalars:
+class _Scalars:
     """A TensorBoard writer for a run folder, as a context that yields a function (step, named numbers)."""
 
     def __init__(self, folder: Path, step: int) -> None:

@@ -4,8 +4,8 @@ Inside one cell T(x) is a convex combination of the eight corner transforms T_k,
 T_k [x; 1] over the corners k and the x of the cell. The queries inside that box are the only ones that can have a root in the
 cell. The first step of Newton's method from the cell's centre needs nothing but the centre's value and inverse Jacobian,
 which all queries of a cell share; where it leads too far out of the cell for how curved the field is in it, the pair is
-dropped. What remains, hardly more than the roots, is solved with the exact Jacobian of the trilinear field. No start
-bones, nothing to tune, and a query outside all boxes is known to have no correspondence at all.
+dropped. What remains, about three pairs for a root while an avatar trains, is solved with the exact Jacobian of the trilinear
+field. There are no start bones, and a query outside all boxes is known to have no correspondence at all.
 
 This is the readable version in PyTorch. Two things may be missed: a second root of the same query in one cell, where the
 determinant of the Jacobian changes sign and one start is not enough; and a root in a cell more curved between its corners than
@@ -23,7 +23,7 @@ from snarfcli.deformer.skinning import forward_jacobian
 
 __all__ = ["complete_roots", "posed_cell_boxes"]
 
-_QUERIES_AT_ONCE = 65_536  # bounds the memory: about 20 candidate cells for a query near the body
+_QUERIES_AT_ONCE = 65_536  # bounds the memory: a query has several candidate cells
 _CELLS_AT_ONCE = 200_000  # likewise: 400 bytes of corner transforms a cell, and as much for each intermediate result
 _BINS_PER_SIDE = 96
 _STRAY = 0.75  # of a cell beyond the cell at which a candidate is given up; a neighbour owns the root, if there is one

@@ -87,7 +87,7 @@ def find_correspondences(
         bone_transforms: [B, J, 4, 4], canonical to posed, metres; invertible.
         skinning_weights: [D, H, W, J] at the grid nodes (z, y, x), rows sum to 1.
         grid: the box of the nodes.
-        search: "complete" (every root, cell by cell) or "broyden" (the papers': one start per bone).
+        search: "complete" (cell by cell, without start bones) or "broyden" (the papers': one start per bone).
         init_bones: bones that start a broyden search; None for all.
         active_cells: bool [D-1, H-1, W-1], the cells that a complete search looks into; None for all.
         tolerance: largest residual of a root, as a share of the grid's longest side.

@@ -13,7 +13,7 @@ __all__ = ["Roots", "SearchConfig", "drop_duplicates", "invert_3x3"]
 @dataclass
 class SearchConfig:
     name: str = "complete"
-    """Which search: complete (every root, cell by cell) or broyden (the papers')."""
+    """Which search: complete (cell by cell, without start bones) or broyden (the papers')."""
     init_bones: list[int] | None = None
     """Bones whose inverse transforms start a broyden search; null means all bones."""
     jacobian: str = "exact"

@@ -14,7 +14,7 @@ from snarfcli.segments import distance_to_segments
 __all__ = ["OccupancyNetwork", "ShapeConfig"]
 
 _SOFTPLUS_SHARPNESS = 100.0  # as in the papers' code
-_LOGITS_PER_METRE = 30.0  # slope of the capsule prior across the surface; 100 learned more slowly
+_LOGITS_PER_METRE = 30.0  # slope of the capsule prior across the surface
 
 
 @dataclass

@@ -6,10 +6,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.bodies import axis_angle_to_matrix
-from snarfcli.deformer import CanonicalGrid, blend_transforms
-from snarfcli.deformer.complete import posed_cell_boxes
-from snarfcli.deformer.grid import cell_corners, trilinear_weights
-from snarfcli.deformer.skinning import forward_jacobian
+from snarfcli.deformer import CanonicalGrid
 
 
 def smooth_weights(shape: tuple[int, int, int], bones: int, seed: int = 0, dtype=torch.float64) -> Tensor:
@@ -64,50 +61,9 @@ def posed_queries(weights: Tensor, transforms: Tensor, count: int, seed: int = 0
     return move(canonical, weights, transforms, grid), canonical
 
 
-def exhaustive_roots(points: Tensor, weights: Tensor, transforms: Tensor, grid: CanonicalGrid, levels: int = 4):
-    """Find all roots of one pose in float64: cut cells into eight, `levels` times, while their posed box holds the query.
+def exhaustive_roots(points: Tensor, weights: Tensor, transforms: Tensor, grid: CanonicalGrid) -> list[Tensor]:
+    """Return all roots of one pose in float64, a [K, 3] tensor for each query (see `deformer/ground_truth.py`)."""
+    from ground_truth import true_roots  # beside the deformer's tests, which put their folder on the path
 
-    Within a sub-cell the field is trilinear too, so the same bound holds with its own corner transforms. From the centre of
-    each remaining sub-cell Newton's method is run; roots are kept if they lie in their sub-cell.
-
-    Returns:
-        List of [K, 3] tensors, one for each query.
-    """
-    shape = weights.shape[:3]
-    total = (shape[0] - 1) * (shape[1] - 1) * (shape[2] - 1)
-    corners = cell_corners(torch.arange(total), shape)
-    node_transforms = blend_transforms(weights, transforms[None])[0]
-    all_origins = grid.nodes(shape).reshape(-1, 3)[corners[:, 0]]
-    cell_size = grid.cell_size(shape)
-    query = torch.arange(len(points)).repeat_interleave(total)
-    cell = torch.arange(total).repeat(len(points))
-    low = torch.zeros(len(cell), 3, dtype=points.dtype)
-    side = 1.0
-    for level in range(levels + 1):
-        local = low[:, None] + side * torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])
-        sub = torch.bmm(trilinear_weights(local), node_transforms[corners[cell]])
-        lower, upper = posed_cell_boxes(sub, all_origins[cell] + low * cell_size, side * cell_size)
-        slack = 1e-9
-        keep = ((points[query] >= lower - slack) & (points[query] <= upper + slack)).all(1)
-        query, cell, low = query[keep], cell[keep], low[keep]
-        if level < levels:
-            side /= 2
-            offsets = side * torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])
-            low = (low[:, None] + offsets).reshape(-1, 3)
-            query, cell = query.repeat_interleave(8), cell.repeat_interleave(8)
-    local = low + side / 2
-    for _ in range(30):
-        posed, jacobian = forward_jacobian(node_transforms[corners[cell]], local, all_origins[cell], cell_size)
-        step = torch.linalg.solve(jacobian + 1e-14 * torch.eye(3), posed - points[query])
-        local = local - step / (step.abs().amax(1, keepdim=True) / (2 * side)).clamp_min(1)
-    posed, _ = forward_jacobian(node_transforms[corners[cell]], local, all_origins[cell], cell_size)
-    good = ((posed - points[query]).norm(dim=1) < 1e-10) & (local >= -1e-7).all(1) & (local <= 1 + 1e-7).all(1)
-    canonical = all_origins[cell] + local * cell_size
-    found = []
-    for q in range(len(points)):
-        roots: list[Tensor] = []
-        for root in canonical[good & (query == q)]:
-            if all((root - other).norm() > 1e-6 for other in roots):
-                roots.append(root)
-        found.append(torch.stack(roots) if roots else canonical.new_empty(0, 3))
-    return found
+    truth = true_roots(points.numpy(), weights.numpy(), transforms.numpy(), grid.lower.numpy(), grid.upper.numpy())
+    return [torch.from_numpy(truth.of(q)) for q in range(len(points))]

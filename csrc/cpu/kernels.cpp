@@ -1,0 +1,362 @@
+// The inner loops of the CPU library, compiled once per instruction set with SNARF_ISA naming it.
+//
+// DESIGN. Cell by cell, not query by query. A block of cells side by side is turned into polynomials with one lane per cell
+// (cell.h); then each cell fetches the queries of the bins that its posed box touches, tests them with one lane per query, and
+// solves for the survivors with one lane per query and the cell's coefficients as broadcast scalars: no gathers from the grid.
+// A cell that may hold several roots of one query is cut into eight parts, each of which fetches from its parent's candidates.
+#include "kernels.h"
+
+#include "lanes.h"
+#include "snarf/broyden.h"
+#include "snarf/cell.h"
+#include "snarf/implicit.h"
+#include "snarf/newton.h"
+
+namespace snarf {
+namespace SNARF_ISA {
+namespace {
+
+// The polynomials of kWidth cells, one a lane, laid out so that one cell's numbers can be picked out.
+template <class S> struct CellLanes {
+  static constexpr int width = Lanes<S>::width;
+  Cell<Lanes<S>> cell;
+  CellBounds<Lanes<S>> bounds;
+};
+
+// One cell or part of a cell, ready to be searched.
+template <class S> struct Part {
+  S c[3 * kMonomials];
+  S box[3], inverse[9], reach[3], curvature;
+  S shift[3], scale;  // its centre and side within the cell, cell coordinates
+  int level;
+};
+
+template <class S> struct Search {
+  const CompleteTask<S>& task;
+  Scratch& scratch;
+  RootSink<S>& sink;
+  S centre[3];  // canonical centre of the cell
+  int32_t cell;
+};
+
+template <class S> Grid<S> grid_of(const Geometry<S>& geometry) {
+  Grid<S> grid;
+  for (int i = 0; i < 3; ++i) {
+    grid.lower[i] = geometry.lower[i];
+    grid.size[i] = geometry.size[i];
+    grid.nodes[i] = geometry.nodes[i];
+  }
+  return grid;
+}
+
+// Cells x .. x + width - 1 of a row, one a lane; beyond the end of the row the last node is repeated.
+template <class S> void load_cells(const S* transforms, const Geometry<S>& geometry, int x, int y, int z, CellLanes<S>& out) {
+  using V = Lanes<S>;
+  constexpr int width = V::width;
+  const int64_t row_nodes = geometry.nodes[0];
+  V corner[8 * 12];
+  for (int row = 0; row < 4; ++row) {
+    S columns[12][width + 1];
+    const S* nodes = transforms + 12 * ((int64_t(z + (row >> 1)) * geometry.nodes[1] + y + (row & 1)) * row_nodes);
+    for (int i = 0; i <= width; ++i) {
+      const S* node = nodes + 12 * (x + i < row_nodes ? x + i : row_nodes - 1);
+      for (int r = 0; r < 12; ++r) columns[r][i] = node[r];
+    }
+    for (int r = 0; r < 12; ++r) {
+      corner[(2 * row) * 12 + r] = load<S>(columns[r]);
+      corner[(2 * row + 1) * 12 + r] = load<S>(columns[r] + 1);
+    }
+  }
+  V centre[3];
+  S along[width];
+  for (int i = 0; i < width; ++i) along[i] = geometry.lower[0] + (S(x + i) + S(0.5)) * geometry.size[0];
+  centre[0] = load<S>(along);
+  centre[1] = V(geometry.lower[1] + (S(y) + S(0.5)) * geometry.size[1]);
+  centre[2] = V(geometry.lower[2] + (S(z) + S(0.5)) * geometry.size[2]);
+  cell_from_corners(corner, centre, geometry.size, out.cell);
+  bound_cell<V, S>(out.cell, out.bounds);
+}
+
+template <class S> void boxes(const S* transforms, const Geometry<S>& geometry, const Block* blocks, int64_t count, BlockBoxes<S>* out) {
+  using V = Lanes<S>;
+  constexpr int width = V::width;
+  for (int64_t n = 0; n < count; ++n) {
+    const Block& block = blocks[n];
+    for (int first = 0; first < kBlock; first += width) {
+      const uint32_t active = block.active >> first & ((1u << width) - 1);
+      for (int i = 0; i < 3; ++i)
+        for (int k = first; k < first + width; ++k) {
+          out[n].lower[i][k] = S(1);
+          out[n].upper[i][k] = S(-1);
+        }
+      if (!active) continue;
+      CellLanes<S> cells;
+      load_cells(transforms, geometry, block.x + first, block.y, block.z, cells);
+      for (int i = 0; i < 3; ++i)
+        for (int k = 0; k < width; ++k) {
+          const S centre = cells.cell.c[kMonomials * i][k], extent = cells.bounds.box[i][k];
+          const bool usable = extent < S(1e15) && centre - centre == 0;  // non-finite or absurd transforms give no root
+          if (!(active >> k & 1) || !usable) continue;
+          out[n].lower[i][first + k] = centre - extent;
+          out[n].upper[i][first + k] = centre + extent;
+        }
+    }
+  }
+}
+
+template <class S> void pick(const CellLanes<S>& from, int lane, Part<S>& part) {
+  for (int m = 0; m < 3 * kMonomials; ++m) part.c[m] = from.cell.c[m][lane];
+  for (int i = 0; i < 9; ++i) part.inverse[i] = from.bounds.inverse[i][lane];
+  for (int i = 0; i < 3; ++i) {
+    part.box[i] = from.bounds.box[i][lane];
+    part.reach[i] = from.bounds.reach[i][lane];
+  }
+  part.curvature = from.bounds.curvature[lane];
+}
+
+// The part's bounds, broadcast once for many queries.
+template <class S> struct Test {
+  using V = Lanes<S>;
+  V centre[3], box[3], inverse[9], reach[3];
+  explicit Test(const Part<S>& part) {
+    for (int i = 0; i < 3; ++i) {
+      centre[i] = V(part.c[kMonomials * i]);
+      box[i] = V(part.box[i]);
+      reach[i] = V(part.reach[i]);
+    }
+    for (int i = 0; i < 9; ++i) inverse[i] = V(part.inverse[i]);
+  }
+  SNARF_HD LaneMask<S> operator()(V x, V y, V z) const {
+    const V offset[3] = {x - centre[0], y - centre[1], z - centre[2]};
+    return may_hold(box, inverse, reach, offset);
+  }
+};
+
+// Coordinates of up to `width` queries by their places; lanes beyond `count` repeat the first.
+template <class S> void fetch(const SortedQueries<S>& queries, const int32_t* places, int count, Lanes<S>* out) {
+  constexpr int width = Lanes<S>::width;
+  for (int i = 0; i < 3; ++i) {
+    S values[width];
+    for (int k = 0; k < width; ++k) values[k] = queries.at[i][places[k < count ? k : 0]];
+    out[i] = load<S>(values);
+  }
+}
+
+template <class S>
+void emit(Search<S>& search, const Part<S>& part, const int32_t* places, uint32_t found, const Lanes<S>* s, const Lanes<S>* inverse) {
+  const Geometry<S>& geometry = search.task.geometry;
+  for (; found; found &= found - 1) {
+    const int lane = lowest_bit(found);
+    if (search.sink.next == search.sink.end) search.sink.more(&search.sink);
+    Root<S>& root = *search.sink.next;
+    root.query = search.task.queries.query[places[lane]];
+    root.order = search.cell;
+    for (int i = 0; i < 3; ++i) {
+      root.canonical[i] = search.centre[i] + geometry.size[i] * (part.shift[i] + part.scale * s[i][lane]);
+      for (int j = 0; j < 3; ++j) root.inverse[3 * i + j] = inverse[3 * i + j][lane] * (geometry.size[i] * part.scale);
+    }
+    S minors[9];
+    if (!search.task.orientation_preserving || adjugate(root.inverse, minors) > 0) ++search.sink.next;
+  }
+}
+
+// Newton's method for all candidates of a part. With `corner` < 8 it starts from that corner, with 8 from the centre, with 9 from
+// the affine guess.
+template <class S> void solve(Search<S>& search, const Part<S>& part, const int32_t* places, int64_t count, int start) {
+  using V = Lanes<S>;
+  constexpr int width = V::width;
+  const Solver<S> solver{search.task.tolerance, search.task.max_steps};
+  const S reach = S(0.5) + face_tolerance<S>() / part.scale;
+  for (int64_t first = 0; first < count; first += width) {
+    const int here = count - first < width ? int(count - first) : width;
+    V offset[3], s[3], inverse[9];
+    fetch(search.task.queries, places + first, here, offset);
+    for (int i = 0; i < 3; ++i) offset[i] = offset[i] - part.c[kMonomials * i];
+    for (int i = 0; i < 3; ++i) {
+      if (start == 9) {
+        const V guess = offset[0] * part.inverse[3 * i] + offset[1] * part.inverse[3 * i + 1] + offset[2] * part.inverse[3 * i + 2];
+        s[i] = smaller(larger(guess, V(S(-0.5))), V(S(0.5)));
+      } else {
+        s[i] = V(start == 8 ? S(0) : start >> i & 1 ? S(0.5) : S(-0.5));
+      }
+    }
+    for (int i = 0; i < 9; ++i) inverse[i] = V(S(0));
+    const LaneMask<S> found = solve_in_cell(part.c, offset, first_lanes<S>(here), solver, reach, s, inverse);
+    emit(search, part, places + first, bits(found), s, inverse);
+  }
+}
+
+// Finds the roots in a part for `count` candidates, which stand at `begin` in the scratch list; what follows them is free.
+template <class S> void search_part(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count) {
+  using V = Lanes<S>;
+  constexpr int width = V::width;
+  if (part.curvature < S(kTame)) return solve(search, part, search.scratch.data + begin, count, 9);
+  if (part.level == kLevels) {
+    for (int start = 0; start < 10; ++start) solve(search, part, search.scratch.data + begin, count, start);
+    return;
+  }
+  search.scratch.reserve(&search.scratch, begin + 2 * count);
+  CellLanes<S> whole, parts;
+  for (int m = 0; m < 3 * kMonomials; ++m) whole.cell.c[m] = V(part.c[m]);
+  for (int eighth = 0; eighth < 8; eighth += width) {
+    V shift[3];
+    for (int i = 0; i < 3; ++i) {
+      S values[width];
+      for (int k = 0; k < width; ++k) values[k] = (eighth + k) >> i & 1 ? S(0.25) : S(-0.25);
+      shift[i] = load<S>(values);
+    }
+    halve_cell<V, S>(whole.cell, shift, parts.cell);
+    bound_cell<V, S>(parts.cell, parts.bounds);
+    for (int lane = 0; lane < width && eighth + lane < 8; ++lane) {
+      Part<S> child;
+      pick(parts, lane, child);
+      child.level = part.level + 1;
+      child.scale = part.scale * S(0.5);
+      for (int i = 0; i < 3; ++i) child.shift[i] = part.shift[i] + part.scale * shift[i][lane];
+      const Test<S> test(child);
+      int32_t* const places = search.scratch.data + begin;
+      int64_t kept = 0;
+      for (int64_t first = 0; first < count; first += width) {
+        const int here = count - first < width ? int(count - first) : width;
+        V at[3];
+        fetch(search.task.queries, places + first, here, at);
+        for (uint32_t inside = bits(test(at[0], at[1], at[2]) & first_lanes<S>(here)); inside; inside &= inside - 1)
+          places[count + kept++] = places[first + lowest_bit(inside)];
+      }
+      if (kept) search_part(search, child, begin + count, kept);
+    }
+  }
+}
+
+template <class S> int32_t bin_of(const SortedQueries<S>& queries, int axis, S position) {
+  const S bin = (position - queries.lower[axis]) * queries.per_metre;
+  return bin > 0 ? (bin < S(queries.bins[axis]) ? int32_t(bin) : queries.bins[axis] - 1) : 0;
+}
+
+template <class S>
+void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>& boxes, Scratch& scratch, RootSink<S>& sink) {
+  using V = Lanes<S>;
+  constexpr int width = V::width;
+  const SortedQueries<S>& queries = task.queries;
+  for (int first = 0; first < kBlock; first += width) {
+    if (!(block.active >> first & ((1u << width) - 1))) continue;
+    CellLanes<S> cells;
+    bool loaded = false;
+    for (int lane = 0; lane < width; ++lane) {
+      const int k = first + lane;
+      bool touched = true;
+      for (int i = 0; i < 3; ++i)
+        touched &= boxes.lower[i][k] <= boxes.upper[i][k] && boxes.upper[i][k] >= queries.lower[i] && boxes.lower[i][k] <= queries.upper[i];
+      if (!touched) continue;
+      int32_t low[3], high[3];
+      for (int i = 0; i < 3; ++i) {
+        low[i] = bin_of(queries, i, boxes.lower[i][k]);
+        high[i] = bin_of(queries, i, boxes.upper[i][k]);
+      }
+      int64_t near = 0;
+      for (int32_t z = low[2]; z <= high[2]; ++z)
+        for (int32_t y = low[1]; y <= high[1]; ++y) {
+          const int64_t row = (int64_t(z) * queries.bins[1] + y) * queries.bins[0];
+          near += queries.begin[row + high[0] + 1] - queries.begin[row + low[0]];
+        }
+      if (!near) continue;
+      if (!loaded) load_cells(task.transforms, task.geometry, block.x + first, block.y, block.z, cells);
+      loaded = true;
+      scratch.reserve(&scratch, near);
+      Part<S> part;
+      pick(cells, lane, part);
+      part.level = 0;
+      part.scale = 1;
+      part.shift[0] = part.shift[1] = part.shift[2] = 0;
+      const Test<S> test(part);
+      int64_t kept = 0;
+      for (int32_t z = low[2]; z <= high[2]; ++z)
+        for (int32_t y = low[1]; y <= high[1]; ++y) {
+          const int64_t row = (int64_t(z) * queries.bins[1] + y) * queries.bins[0];
+          const int32_t end = queries.begin[row + high[0] + 1];
+          for (int32_t i = queries.begin[row + low[0]]; i < end; i += width) {
+            uint32_t inside = bits(test(load<S>(queries.at[0] + i), load<S>(queries.at[1] + i), load<S>(queries.at[2] + i)));
+            if (end - i < width) inside &= (1u << (end - i)) - 1;
+            for (; inside; inside &= inside - 1) scratch.data[kept++] = i + lowest_bit(inside);
+          }
+        }
+      if (!kept) continue;
+      const int32_t x = block.x + k;
+      Search<S> here{task, scratch, sink, {}, 0};
+      here.cell = int32_t((int64_t(block.z) * (task.geometry.nodes[1] - 1) + block.y) * (task.geometry.nodes[0] - 1) + x);
+      const int32_t index[3] = {x, block.y, block.z};
+      for (int i = 0; i < 3; ++i) here.centre[i] = task.geometry.lower[i] + (S(index[i]) + S(0.5)) * task.geometry.size[i];
+      search_part(here, part, 0, kept);
+    }
+  }
+}
+
+template <class S> void broyden_queries(const BroydenTask<S>& task, int64_t first, int64_t last, int32_t query_offset, RootSink<S>& sink) {
+  const Grid<S> grid = grid_of(task.geometry);
+  const Broyden<S> settings{task.tolerance, task.divergence, task.max_steps, task.exact_jacobian};
+  for (int64_t n = first; n < last; ++n) {
+    const S* target = task.points + 3 * n;
+    if (!(target[0] - target[0] == 0 && target[1] - target[1] == 0 && target[2] - target[2] == 0)) continue;
+    S known[3 * 64];  // roots of this query so far; more than 64 distinct ones would only be reported twice
+    int roots = 0;
+    for (int64_t start = 0; start < task.count; ++start) {
+      const S* back = task.starts + 12 * start;
+      S x[3], inverse[9], minors[9];
+      for (int i = 0; i < 3; ++i)
+        x[i] = back[4 * i] * target[0] + back[4 * i + 1] * target[1] + back[4 * i + 2] * target[2] + back[4 * i + 3];
+      if (!(x[0] - x[0] == 0 && x[1] - x[1] == 0 && x[2] - x[2] == 0)) continue;
+      if (!broyden(task.transforms, grid, settings, target, x, inverse)) continue;
+      bool is_new = true;
+      for (int k = 0; k < roots; ++k) {
+        S distance2 = 0;
+        for (int i = 0; i < 3; ++i) distance2 += (x[i] - known[3 * k + i]) * (x[i] - known[3 * k + i]);
+        if (distance2 < task.same_root * task.same_root) is_new = false;
+      }
+      if (!is_new || (task.orientation_preserving && !(adjugate(inverse, minors) > 0))) continue;
+      if (roots < 64) {
+        for (int i = 0; i < 3; ++i) known[3 * roots + i] = x[i];
+        ++roots;
+      }
+      if (sink.next == sink.end) sink.more(&sink);
+      Root<S>& root = *sink.next++;
+      root.query = int32_t(n) + query_offset;
+      root.order = int32_t(start);
+      for (int i = 0; i < 3; ++i) root.canonical[i] = x[i];
+      for (int i = 0; i < 9; ++i) root.inverse[i] = inverse[i];
+    }
+  }
+}
+
+template <class S> void backward(const BackwardTask<S>& task) {
+  const Grid<S> grid = grid_of(task.geometry);
+  const int64_t layer = int64_t(grid.nodes[0]) * grid.nodes[1];
+  for (int64_t m = 0; m < task.roots; ++m) {
+    const S* x = task.canonical + 3 * m;
+    S local[3], v[3];
+    const int64_t first = locate(grid, x, local);
+    const int64_t z = first / layer;
+    if (task.v_transforms && (z + 1 < task.layers[0] || z >= task.layers[1])) continue;
+    pull_back(task.inverse + 9 * m, task.gradient + 3 * m, v);
+    if (task.v_points)
+      for (int i = 0; i < 3; ++i) task.v_points[3 * (task.query[m] - task.first_query) + i] += v[i];
+    if (!task.v_transforms) continue;
+    S weights[8], gradient[12];
+    corner_weights(local, weights);
+    transform_gradient(v, x, gradient);
+    for (int k = 0; k < 8; ++k) {
+      const int64_t owner = z + (k >> 2);
+      if (owner < task.layers[0] || owner >= task.layers[1]) continue;
+      S* node = task.v_transforms + 12 * corner_node(grid, first, k);
+      for (int r = 0; r < 12; ++r) node[r] += weights[k] * gradient[r];
+    }
+  }
+}
+
+}  // namespace
+
+template <class S> Kernels<S> kernels() { return {boxes<S>, search<S>, broyden_queries<S>, backward<S>}; }
+template Kernels<float> kernels<float>();
+template Kernels<double> kernels<double>();
+
+}  // namespace SNARF_ISA
+}  // namespace snarf

@@ -1,0 +1,110 @@
+// What the search passes to the kernels, which are compiled once per instruction set (kernels.cpp), and what comes back.
+// Plain data only: nothing here may instantiate a template of the standard library inside a kernel.
+#pragma once
+
+#include <stdint.h>
+
+namespace snarf {
+
+constexpr int kBlock = 16;  // cells side by side along x that are handled together
+
+struct Block {
+  int32_t x, y, z;   // its first cell
+  uint32_t active;   // bit k: cell x + k is searched
+};
+
+// Posed boxes of a block's cells, metres; empty (lower > upper) where a cell is not searched.
+template <class S> struct BlockBoxes {
+  S lower[3][kBlock], upper[3][kBlock];
+};
+
+template <class S> struct Geometry {
+  S lower[3], size[3];  // canonical, metres
+  int32_t nodes[3];     // W, H, D
+};
+
+// The queries of one pose, sorted into uniform bins in posed space, x fastest: a run of bins in a row is one contiguous range.
+template <class S> struct SortedQueries {
+  const S* at[3];        // coordinates, readable kBlock numbers beyond the end
+  const int32_t* query;  // which query stands there
+  const int32_t* begin;  // first query of each bin, [bins + 1]
+  S lower[3], upper[3];  // region of the bins, metres
+  S per_metre;           // bins a metre
+  int32_t bins[3];
+};
+
+template <class S> struct Root {
+  int32_t query;
+  int32_t order;  // sorts the roots of one query: the cell (complete) or the start (broyden)
+  S canonical[3];
+  S inverse[9];   // of dd/dx
+};
+
+// Where a thread puts its roots; `more` makes room when next == end.
+template <class S> struct RootSink {
+  Root<S>* next;
+  Root<S>* end;
+  void* owner;
+  void (*more)(RootSink*);
+};
+
+// A growing list of candidate queries, by their place in the sorted order; `reserve` makes room for at least `count`.
+struct Scratch {
+  int32_t* data;
+  int64_t capacity;
+  void* owner;
+  void (*reserve)(Scratch*, int64_t count);
+};
+
+template <class S> struct CompleteTask {
+  const S* transforms;  // of the pose, [V, 12]
+  Geometry<S> geometry;
+  SortedQueries<S> queries;
+  S tolerance;
+  int32_t max_steps;
+  bool orientation_preserving;
+};
+
+template <class S> struct BroydenTask {
+  const S* transforms;  // of the pose, [V, 12]
+  Geometry<S> geometry;
+  const S* points;      // of the pose, [N, 3]
+  const S* starts;      // of the pose, [count, 12]
+  int64_t count;
+  S tolerance, divergence, same_root;
+  int32_t max_steps;
+  bool exact_jacobian, orientation_preserving;
+};
+
+template <class S> struct BackwardTask {
+  Geometry<S> geometry;
+  const S* gradient;   // [M, 3], and so on: the roots of one pose
+  const S* canonical;
+  const S* inverse;
+  const int64_t* query;
+  int64_t roots, first_query;
+  S* v_points;         // of the pose, [N, 3], or null
+  S* v_transforms;     // of the pose, [V, 12], or null
+  int64_t layers[2];   // only nodes with z in [layers[0], layers[1]) are written
+};
+
+template <class S> struct Kernels {
+  // Fills the boxes of `count` blocks.
+  void (*boxes)(const S* transforms, const Geometry<S>&, const Block*, int64_t count, BlockBoxes<S>*);
+  // Finds the roots in one block's cells.
+  void (*search)(const CompleteTask<S>&, const Block&, const BlockBoxes<S>&, Scratch&, RootSink<S>&);
+  // Runs Broyden's method for the queries first to last.
+  void (*broyden)(const BroydenTask<S>&, int64_t first, int64_t last, int32_t query_offset, RootSink<S>&);
+  void (*backward)(const BackwardTask<S>&);
+};
+
+// Cells with a curvature (cell.h) up to this are solved from one start; others are cut into eight.
+constexpr double kTame = 0.9;
+// How often; a part that still is not tame then gets several starts.
+constexpr int kLevels = 4;
+
+namespace avx512 { template <class S> Kernels<S> kernels(); }
+namespace avx2 { template <class S> Kernels<S> kernels(); }
+namespace baseline { template <class S> Kernels<S> kernels(); }
+
+}  // namespace snarf

@@ -1,0 +1,73 @@
+/* Plain C interface of the CPU library; numbers are float or double by `bytes_per_number` (4 or 8). Poses are B, queries a pose N,
+ * nodes V = D H W, cells (D-1)(H-1)(W-1), all arrays dense and row-major. A search is done in two calls, because the number of
+ * roots is only known after it: the first returns a handle and the count, the second writes the roots and frees the handle. */
+#pragma once
+
+#include <stdint.h>
+
+#if defined(_WIN32)
+#define SNARF_API __declspec(dllexport)
+#else
+#define SNARF_API __attribute__((visibility("default")))
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define SNARF_ABI_VERSION 1
+
+enum { SNARF_OK = 0, SNARF_BAD_ARGUMENT = 1, SNARF_OUT_OF_MEMORY = 2 };
+
+typedef struct snarf_field {
+  const void* transforms;  /* blended transforms at the nodes, [B, V, 12] */
+  double lower[3];         /* canonical position of the first node, metres */
+  double size[3];          /* sides of a cell, metres */
+  int32_t nodes[3];        /* W, H, D */
+  int32_t bytes_per_number;
+} snarf_field;
+
+typedef struct snarf_queries {
+  const void* points;      /* [B, N, 3], posed, metres; a non-finite point has no root */
+  int64_t poses;           /* B */
+  int64_t count;           /* N */
+  int32_t threads;         /* at most */
+} snarf_queries;
+
+typedef struct snarf_complete {
+  const uint8_t* active;   /* cells to search, [(D-1)(H-1)(W-1)], or null for all */
+  double tolerance;        /* largest residual of a root, metres */
+  int32_t max_steps;       /* Newton steps from one start */
+  int32_t orientation_preserving;  /* keep only roots with det J > 0 */
+} snarf_complete;
+
+typedef struct snarf_broyden {
+  const void* starts;      /* rows of the inverse bone transforms that give a start, [B, I, 12], posed to canonical */
+  int64_t count;           /* I */
+  double tolerance, divergence;  /* metres */
+  int32_t max_steps;
+  int32_t exact_jacobian;
+  int32_t orientation_preserving;
+} snarf_broyden;
+
+typedef struct snarf_roots snarf_roots;
+
+SNARF_API int snarf_abi_version(void);
+/* Name of the instruction set in use: avx512, avx2 or baseline. SNARF_INSTRUCTION_SET in the environment may ask for a lower one. */
+SNARF_API const char* snarf_instruction_set(void);
+
+SNARF_API int snarf_complete_search(const snarf_field*, const snarf_queries*, const snarf_complete*, snarf_roots** roots, int64_t* found);
+SNARF_API int snarf_broyden_search(const snarf_field*, const snarf_queries*, const snarf_broyden*, snarf_roots** roots, int64_t* found);
+
+/* canonical [M, 3], query [M] (b N + n, ascending), jacobian_inverse [M, 3, 3]. Frees the handle; null pointers only free it. */
+SNARF_API int snarf_take_roots(snarf_roots* roots, void* canonical, int64_t* query, void* jacobian_inverse);
+
+/* Gradients of a loss by the queries [B, N, 3] and by the nodes' transforms [B, V, 12], from that by the roots, [M, 3]. Either
+ * result may be null; both are overwritten. `field.transforms` is not read. */
+SNARF_API int snarf_implicit_backward(const snarf_field*, const snarf_queries*, int64_t roots, const void* gradient,
+                                      const void* canonical, const int64_t* query, const void* jacobian_inverse, void* v_points,
+                                      void* v_transforms);
+
+#ifdef __cplusplus
+}
+#endif

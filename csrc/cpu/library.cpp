@@ -27,6 +27,7 @@ constexpr int64_t kGroupQueries = int64_t(1) << 20;  // queries searched togethe
 constexpr int64_t kGroupBlocks = int64_t(1) << 17;   // blocks of cells of all poses searched together: 50 MB of boxes
 constexpr double kBinPerBox = 0.75;                  // side of a bin, in mean sides of the posed boxes
 constexpr double kSameRoot = 5e-3;                   // of a cell: two reports of one root; Newton's errors are far smaller
+constexpr double kSameBroydenRoot = 5e-2;            // of a cell: Broyden's roots are only as exact as the tolerance
 constexpr int64_t kQueriesPerThread = 2048;          // less is not worth starting a thread for
 
 enum InstructionSet { kBaseline, kAvx2, kAvx512 };
@@ -613,7 +614,7 @@ void broyden_search(const snarf_field& field, const snarf_queries& queries, cons
   common.count = settings.count;
   common.tolerance = S(settings.tolerance);
   common.divergence = S(settings.divergence);
-  common.same_root = S(kSameRoot) * smallest_side(common.geometry);
+  common.same_root = S(kSameBroydenRoot) * smallest_side(common.geometry);
   common.max_steps = settings.max_steps;
   common.exact_jacobian = settings.exact_jacobian != 0;
   common.orientation_preserving = settings.orientation_preserving != 0;

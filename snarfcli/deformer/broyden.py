@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -20,12 +18,11 @@ _SAME_ROOT = 5e-2  # of a cell; Broyden's roots are only as exact as the toleran
 def broyden_roots(
     points: Tensor,
     transforms: Tensor,
-    bone_transforms: Tensor,
+    starts: Tensor,
     grid: CanonicalGrid,
     shape: tuple[int, int, int],
     *,
-    init_bones: Sequence[int] | None = None,
-    jacobian: str = "exact",
+    exact_jacobian: bool = True,
     tolerance: float,
     divergence: float,
     max_steps: int,
@@ -38,11 +35,10 @@ def broyden_roots(
     Args:
         points: queries [B, N, 3], posed space, metres. Non-finite ones have no root.
         transforms: blended transforms [B, D * H * W, 12] at the nodes.
-        bone_transforms: [B, J, 4, 4], canonical to posed.
+        starts: upper three rows of the inverse bone transforms that give a start, [B, I, 12].
         grid: where the nodes are.
         shape: (D, H, W).
-        init_bones: bones that give a start; None for all.
-        jacobian: "exact", or "broyden" for the approximation left by the iteration (Fast-SNARF Eq. 15).
+        exact_jacobian: the inverse Jacobian at the root, or the approximation left by the iteration (Fast-SNARF Eq. 15).
         tolerance: largest residual of a root, metres.
         divergence: residual at which a start is given up, metres.
         max_steps: most steps from one start.
@@ -50,26 +46,24 @@ def broyden_roots(
     Source: SNARF Eq. 6-8; Fast-SNARF Eq. 7-9 and Sec. 4.1.
     """
     batch, count = points.shape[:2]
-    bones = list(range(bone_transforms.shape[1])) if init_bones is None else list(init_bones)
-    canonical_from_posed = torch.linalg.inv(bone_transforms[:, bones])
     same = _SAME_ROOT * float(grid.cell_size(shape).min())
     parts = []
     for b in range(batch):
-        for start in range(0, max(count, 1), _QUERIES_AT_ONCE):
-            queries = points[b, start : start + _QUERIES_AT_ONCE]
+        rows = starts[b].reshape(-1, 3, 4)
+        for first in range(0, max(count, 1), _QUERIES_AT_ONCE):
+            queries = points[b, first : first + _QUERIES_AT_ONCE]
             known = queries.isfinite().all(1).nonzero()[:, 0]
-            inverse = canonical_from_posed[b, :, :3]
-            starts = torch.einsum("jrc,nc->njr", inverse[..., :3], queries[known]) + inverse[..., 3]
-            query = known[:, None].expand(-1, len(bones)).reshape(-1)
+            begin = (torch.einsum("irc,nc->nir", rows[..., :3], queries[known]) + rows[..., 3]).reshape(-1, 3)
+            query = known[:, None].expand(-1, len(rows)).reshape(-1)
             roots = _iterate(
-                queries, query, starts.reshape(-1, 3), transforms[b], grid, shape, jacobian, tolerance, divergence, max_steps
+                queries, query, begin, transforms[b], grid, shape, exact_jacobian, tolerance, divergence, max_steps
             )
-            roots.query += b * count + start
+            roots.query += b * count + first
             parts.append(drop_duplicates(roots, same))
     if not parts:
         none = torch.empty(0, dtype=torch.long, device=points.device)
         empty = transforms.new_empty(1, 12)
-        return _iterate(points.reshape(-1, 3), none, points.new_empty(0, 3), empty, grid, shape, jacobian, 0.0, 0.0, 0)
+        return _iterate(points.reshape(-1, 3), none, points.new_empty(0, 3), empty, grid, shape, True, 0.0, 0.0, 0)
     return Roots.concatenate(parts)
 
 
@@ -80,7 +74,7 @@ def _iterate(
     transforms: Tensor,
     grid: CanonicalGrid,
     shape: tuple[int, int, int],
-    jacobian: str,
+    exact_jacobian: bool,
     tolerance: float,
     divergence: float,
     max_steps: int,
@@ -120,6 +114,6 @@ def _iterate(
         update = (step[:, :, None] - towards) @ row / scale
         inverse = inverse + torch.where(scale.abs() > 1e-20, update, 0.0)
     x, query, inverse, cell, local = (torch.cat(parts) for parts in zip(*found, strict=True))
-    if jacobian == "exact" and len(x):
+    if exact_jacobian and len(x):
         inverse = invert_3x3(evaluate(x)[1])[0]
     return Roots(x, query, inverse, cell, local)

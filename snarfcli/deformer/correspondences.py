@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from snarfcli.deformer.broyden import broyden_roots
-from snarfcli.deformer.complete import complete_roots
-from snarfcli.deformer.grid import CanonicalGrid, cell_corners, trilinear_weights
-from snarfcli.deformer.search import Roots
+from snarfcli.deformer.grid import CanonicalGrid
+from snarfcli.deformer.ops import broyden_search, complete_search
+from snarfcli.deformer.search import invert_3x3
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.precision import matmul_precision
 
@@ -20,7 +19,10 @@ __all__ = ["Correspondences", "find_correspondences"]
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Canonical correspondences of B x N posed points, compact: only real roots."""
+    """Canonical correspondences of B x N posed points, compact: only real roots.
+
+    Where a capacity was given, rows beyond the roots belong to no query; they hold zeros and the query B * N.
+    """
 
     canonical: Tensor
     """[M, 3], metres; differentiable in the points, the skinning weights and the bone transforms."""
@@ -32,27 +34,31 @@ class Correspondences:
     """B."""
     count: int
     """N."""
+    total: Tensor
+    """Number of roots found, [1]; more than M only where a capacity cut them."""
 
     @property
     def pose(self) -> Tensor:
         """Index b of each root's pose, [M]."""
-        return self.query // max(self.count, 1)
+        return (self.query // max(self.count, 1)).clamp_max(max(self.batch - 1, 0))
 
     @property
     def found(self) -> Tensor:
         """Which queries have a correspondence, bool [B, N]."""
-        mask = torch.zeros(self.batch * self.count, dtype=torch.bool, device=self.query.device)
+        mask = torch.zeros(self.batch * self.count + 1, dtype=torch.bool, device=self.query.device)
         mask[self.query] = True
-        return mask.reshape(self.batch, self.count)
+        return mask[:-1].reshape(self.batch, self.count)
 
     def padded(self) -> tuple[Tensor, Tensor]:
         """Return the roots as [B, N, I, 3] and a mask [B, N, I], I the most roots of any query, at least 1."""
         total = self.batch * self.count
-        counts = torch.bincount(self.query, minlength=total)
+        real = (self.query < total).nonzero()[:, 0]
+        query = self.query[real]
+        counts = torch.bincount(query, minlength=total)
         most = max(int(counts.max()), 1) if total else 1
-        slot = torch.arange(len(self.query), device=self.query.device) - (counts.cumsum(0) - counts)[self.query]
-        at = self.query * most + slot
-        roots = self.canonical.new_zeros(total * most, 3).index_copy(0, at, self.canonical)
+        slot = torch.arange(len(query), device=query.device) - (counts.cumsum(0) - counts)[query]
+        at = query * most + slot
+        roots = self.canonical.new_zeros(total * most, 3).index_copy(0, at, self.canonical[real])
         mask = torch.zeros(total * most, dtype=torch.bool, device=at.device)
         mask[at] = True
         return roots.reshape(self.batch, self.count, most, 3), mask.reshape(self.batch, self.count, most)
@@ -62,8 +68,8 @@ class Correspondences:
 
         Source: SNARF Eq. 9.
         """
-        out = values.new_full((self.batch * self.count,), empty)
-        return out.scatter_reduce(0, self.query, values, "amax").reshape(self.batch, self.count)
+        out = values.new_full((self.batch * self.count + 1,), empty)
+        return out.scatter_reduce(0, self.query, values, "amax")[:-1].reshape(self.batch, self.count)
 
 
 def find_correspondences(
@@ -79,6 +85,10 @@ def find_correspondences(
     max_steps: int = 10,
     divergence: float = 0.25,
     jacobian: str = "exact",
+    orientation_preserving: bool = False,
+    backend: str = "auto",
+    capacity: int | None = None,
+    check: bool = True,
 ) -> Correspondences:
     """Find the canonical points that forward skinning moves onto the given posed points.
 
@@ -94,95 +104,77 @@ def find_correspondences(
         max_steps: most steps for one start.
         divergence: residual at which a broyden start is given up, as a share of the grid's longest side.
         jacobian: "exact", or "broyden" for the approximate inverse of a broyden search (Fast-SNARF Eq. 15).
+        orientation_preserving: leave out roots where the Jacobian's determinant is negative: there the body is turned inside out.
+        backend: "native" (the compiled CPU library, CUDA kernels on a GPU), "reference" (PyTorch), or "auto" for native where
+            it is there; a warning says once why it is not.
+        capacity: most roots to return. The results then have this length whatever is found, so that a GPU need not be waited
+            for and the call can be captured in a CUDA graph; rows beyond the roots have the query B * N.
+        check: whether to look at the values of transforms and weights; on a GPU they are never looked at.
 
     Returns:
         The correspondences, differentiable in `points`, `bone_transforms` and `skinning_weights` by implicit
         differentiation at the roots; no gradient passes the iterations. A second derivative is refused.
 
     Raises:
-        ValueError: a shape, name or index does not fit; the message names the argument, what was wanted and what came.
+        ValueError: a shape, name or index does not fit, a transform is not finite or singular, or weights do not sum to 1; the
+            message names the argument, what was wanted and what came.
         TypeError: a dtype is not float32 or float64, or the dtypes differ.
 
     Source: SNARF Sec. 3.2 and 3.4 (Eq. 5-9, 14); Fast-SNARF Sec. 4.
     """
-    _check(points, bone_transforms, skinning_weights, search, init_bones, active_cells, jacobian)
+    _check_shapes(points, bone_transforms, skinning_weights, search, init_bones, active_cells, jacobian, backend, capacity)
+    if check:
+        _check_values(bone_transforms, skinning_weights)
     grid = grid.to(points)
     depth, height, width = skinning_weights.shape[:3]
-    shape = (depth, height, width)
-    length = grid.longest_side
     with matmul_precision("highest"):
         transforms = blend_transforms(skinning_weights, bone_transforms)
-    with torch.no_grad(), matmul_precision("highest"):
-        if search == "complete":
-            roots = complete_roots(
-                points.detach(),
-                transforms.detach(),
-                grid,
-                shape,
-                active_cells=active_cells,
-                tolerance=tolerance * length,
-                max_steps=max_steps,
+    box = (grid.lower, grid.upper, [depth, height, width])
+    common = (orientation_preserving, capacity, backend)
+    if search == "complete":
+        found = complete_search(points, transforms, *box, active_cells, tolerance, max_steps, *common)
+    else:
+        starts = _start_transforms(bone_transforms.detach(), init_bones)
+        found = broyden_search(
+            points, transforms, starts, *box, tolerance, divergence, max_steps, jacobian == "exact", *common
+        )
+    canonical, query, jacobian_inverse, total = found
+    return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
+
+
+def _start_transforms(bone_transforms: Tensor, init_bones: Sequence[int] | None) -> Tensor:
+    """Return the upper rows of the inverse transforms of the start bones, [B, I, 12], posed to canonical."""
+    chosen = bone_transforms if init_bones is None else bone_transforms[:, list(init_bones)]
+    turn, _ = invert_3x3(chosen[..., :3, :3].reshape(-1, 3, 3))
+    shift = -(turn * chosen[..., :3, 3].reshape(-1, 1, 3)).sum(-1)
+    return torch.cat([turn, shift[..., None]], -1).reshape(*chosen.shape[:2], 12)
+
+
+def _check_values(bone_transforms: Tensor, skinning_weights: Tensor) -> None:
+    """Refuse transforms that cannot be inverted and weights that are none; on a GPU this is not looked at."""
+    if bone_transforms.is_cuda or torch.compiler.is_compiling():
+        return
+    with torch.no_grad():
+        turn = bone_transforms[..., :3, :3].reshape(-1, 3, 3)
+        if not bool(bone_transforms.isfinite().all()):
+            raise ValueError("bone_transforms must be finite, got NaN or infinite values")
+        _, determinant = invert_3x3(turn)
+        singular = (determinant.abs() <= 1e-9 * turn.abs().amax((1, 2)) ** 3).nonzero()[:, 0]
+        if len(singular):
+            pose, bone = divmod(int(singular[0]), bone_transforms.shape[1])
+            raise ValueError(f"bone_transforms must be invertible, got a singular one for bone {bone} of pose {pose}")
+        total = skinning_weights.sum(-1)
+        wrong = ~((total - 1).abs() < 1e-3) & (total != 0)
+        if bool(wrong.any()):
+            came = float(total[wrong][0])
+            raise ValueError(
+                f"skinning_weights must sum to 1 at every node (or be all 0 where no cell is searched), got a sum of {came:.4g}"
             )
-        else:
-            roots = broyden_roots(
-                points.detach(),
-                transforms.detach(),
-                bone_transforms.detach(),
-                grid,
-                shape,
-                init_bones=init_bones,
-                jacobian=jacobian,
-                tolerance=tolerance * length,
-                divergence=divergence * length,
-                max_steps=max_steps,
-            )
-    canonical = _attach_gradient(points, transforms, roots, shape)
-    return Correspondences(canonical, roots.query, roots.jacobian_inverse, points.shape[0], points.shape[1])
 
 
-def _attach_gradient(points: Tensor, transforms: Tensor, roots: Roots, shape: tuple[int, int, int]) -> Tensor:
-    """Return the roots' canonical points [M, 3] with the implicit gradient to `points` and `transforms`."""
-    if not (torch.is_grad_enabled() and (points.requires_grad or transforms.requires_grad)):
-        return roots.canonical
-    pose = roots.query // max(points.shape[1], 1)
-    nodes = cell_corners(roots.cell, shape) + (pose * transforms.shape[1])[:, None]
-    return _ImplicitRoots.apply(points, transforms, roots.canonical, roots.jacobian_inverse, roots.query, nodes, roots.local)
-
-
-class _ImplicitRoots(torch.autograd.Function):
-    """Derivative of the roots of T(x) [x; 1] = x' by the queries x' and the blended node transforms T_v.
-
-    With g the gradient of the loss by x*, implicit differentiation (SNARF Eq. 14) gives J^-T g for the query, and
-    -J^-T g outer [x*; 1], weighted trilinearly, for each of the eight nodes of the root's cell.
-    """
-
-    @staticmethod
-    def forward(ctx, points, transforms, canonical, jacobian_inverse, query, nodes, local):
-        ctx.save_for_backward(canonical, jacobian_inverse, query, nodes, local)
-        ctx.shapes = points.shape, transforms.shape
-        return canonical.clone()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, gradient):
-        canonical, jacobian_inverse, query, nodes, local = ctx.saved_tensors
-        points_shape, transforms_shape = ctx.shapes
-        with matmul_precision("highest"):
-            pulled = torch.bmm(jacobian_inverse.transpose(1, 2), gradient[:, :, None])
-        v_points = v_transforms = None
-        if ctx.needs_input_grad[0]:
-            v_points = gradient.new_zeros(points_shape[0] * points_shape[1], 3)
-            v_points = v_points.index_add(0, query, pulled[:, :, 0]).reshape(points_shape)
-        if ctx.needs_input_grad[1]:
-            homogeneous = torch.cat([canonical, torch.ones_like(canonical[:, :1])], 1)
-            v_blended = -(pulled * homogeneous[:, None]).reshape(-1, 12)
-            v_corners = trilinear_weights(local)[..., None] * v_blended[:, None]
-            v_transforms = gradient.new_zeros(transforms_shape[0] * transforms_shape[1], 12)
-            v_transforms = v_transforms.index_add(0, nodes.reshape(-1), v_corners.reshape(-1, 12)).reshape(transforms_shape)
-        return v_points, v_transforms, None, None, None, None, None
-
-
-def _check(points, bone_transforms, skinning_weights, search, init_bones, active_cells, jacobian) -> None:
+def _check_shapes(
+    points, bone_transforms, skinning_weights, search, init_bones, active_cells, jacobian, backend, capacity
+) -> None:
     """Refuse arguments that do not fit together."""
     if points.ndim != 3 or points.shape[2] != 3:
         raise ValueError(f"points must have shape [B, N, 3], got {list(points.shape)}")
@@ -212,3 +204,9 @@ def _check(points, bone_transforms, skinning_weights, search, init_bones, active
     cells = [n - 1 for n in skinning_weights.shape[:3]]
     if active_cells is not None and (list(active_cells.shape) != cells or active_cells.dtype != torch.bool):
         raise ValueError(f"active_cells must be bool {cells}, got {active_cells.dtype} {list(active_cells.shape)}")
+    if active_cells is not None and active_cells.device != points.device:
+        raise ValueError(f"active_cells must be on the device of points, {points.device}, got {active_cells.device}")
+    if backend not in ("auto", "native", "reference"):
+        raise ValueError(f"backend must be 'auto', 'native' or 'reference', got {backend!r}")
+    if capacity is not None and capacity < 0:
+        raise ValueError(f"capacity must be 0 or more, got {capacity}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 
 import torch
 from torch import Tensor
@@ -25,8 +25,12 @@ class CanonicalGrid:
     """Corner with the smallest coordinates, [3], metres."""
     upper: Tensor
     """Corner with the largest coordinates, [3], metres."""
+    checked: InitVar[bool] = False
+    """Whether the corners are known to be right; looking at them waits for a GPU."""
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, checked: bool) -> None:
+        if checked:
+            return
         for name in ("lower", "upper"):
             if tuple(getattr(self, name).shape) != (3,):
                 raise ValueError(f"grid.{name} must have shape [3], got {list(getattr(self, name).shape)}")
@@ -46,7 +50,7 @@ class CanonicalGrid:
 
     def to(self, like: Tensor) -> CanonicalGrid:
         """Return the same box with the dtype and on the device of `like`."""
-        return CanonicalGrid(self.lower.to(like), self.upper.to(like))
+        return CanonicalGrid(self.lower.to(like), self.upper.to(like), checked=True)
 
     def cell_size(self, shape: Sequence[int]) -> Tensor:
         """Return the sides of one cell along x, y, z, [3], metres, for nodes laid out as `shape` = (D, H, W)."""

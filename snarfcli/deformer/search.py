@@ -24,6 +24,10 @@ class SearchConfig:
     """Most steps of Newton's or Broyden's method for one start."""
     divergence: float = 0.25
     """Residual at which a broyden start is given up, as a share of the longest side of the canonical grid."""
+    orientation_preserving: bool = False
+    """Whether roots are left out where the body is turned inside out (negative determinant of the Jacobian)."""
+    backend: str = "auto"
+    """What computes: native (the compiled library or CUDA kernels), reference (PyTorch), or auto for native where it is there."""
 
 
 @dataclass

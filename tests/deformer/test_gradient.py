@@ -43,7 +43,7 @@ def test_second_derivative_is_refused(scene):
     points = points.clone().requires_grad_()
     result = find_correspondences(points, transforms, scores.softmax(-1), unit_grid())
     (first,) = torch.autograd.grad(result.canonical.square().sum(), points, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
+    with pytest.raises(RuntimeError, match="second derivative of a correspondence search"):
         first.sum().backward()
 
 

@@ -1,0 +1,188 @@
+"""The CPU library's functions on tensors: what csrc/include/snarf/api.h declares, without the pointers."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import POINTER, Structure, byref, c_double, c_int32, c_int64, c_uint8, c_void_p
+
+import torch
+from torch import Tensor
+
+from snarfcli.deformer.library import native_library
+
+__all__ = ["broyden_search", "complete_search", "implicit_backward"]
+
+
+class _Field(Structure):
+    _fields_ = [
+        ("transforms", c_void_p),
+        ("lower", c_double * 3),
+        ("size", c_double * 3),
+        ("nodes", c_int32 * 3),
+        ("bytes_per_number", c_int32),
+    ]
+
+
+class _Queries(Structure):
+    _fields_ = [("points", c_void_p), ("poses", c_int64), ("count", c_int64), ("threads", c_int32)]
+
+
+class _Complete(Structure):
+    _fields_ = [
+        ("active", POINTER(c_uint8)),
+        ("tolerance", c_double),
+        ("max_steps", c_int32),
+        ("orientation_preserving", c_int32),
+    ]
+
+
+class _Broyden(Structure):
+    _fields_ = [
+        ("starts", c_void_p),
+        ("count", c_int64),
+        ("tolerance", c_double),
+        ("divergence", c_double),
+        ("max_steps", c_int32),
+        ("exact_jacobian", c_int32),
+        ("orientation_preserving", c_int32),
+    ]
+
+
+def complete_search(
+    points: Tensor,
+    transforms: Tensor,
+    lower: Tensor,
+    size: Tensor,
+    shape: tuple[int, int, int],
+    active: Tensor | None,
+    tolerance: float,
+    max_steps: int,
+    orientation_preserving: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the roots in every active cell.
+
+    Args:
+        points: queries [B, N, 3], posed space, metres.
+        transforms: blended transforms [B, D * H * W, 12] at the nodes.
+        lower: canonical position of the first node, [3], metres.
+        size: sides of a cell, [3], metres.
+        shape: nodes (D, H, W).
+        active: bool [D-1, H-1, W-1]; None for all cells.
+        tolerance: largest residual of a root, metres.
+        max_steps: most Newton steps from one start.
+        orientation_preserving: keep only roots where the Jacobian's determinant is positive.
+
+    Returns:
+        canonical [M, 3], query [M] (b * N + n, ascending) and the inverse of dd/dx, [M, 3, 3].
+    """
+    points, transforms = points.contiguous(), transforms.contiguous()
+    mask = None if active is None else active.to(torch.uint8).contiguous()
+    settings = _Complete(
+        None if mask is None else ctypes.cast(mask.data_ptr(), POINTER(c_uint8)), tolerance, max_steps, orientation_preserving
+    )
+    field = _field(transforms, lower, size, shape)
+    return _search("snarf_complete_search", field, points, settings)
+
+
+def broyden_search(
+    points: Tensor,
+    transforms: Tensor,
+    starts: Tensor,
+    lower: Tensor,
+    size: Tensor,
+    shape: tuple[int, int, int],
+    tolerance: float,
+    divergence: float,
+    max_steps: int,
+    exact_jacobian: bool,
+    orientation_preserving: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Run Broyden's method from every start; arguments and results as in `complete_search`.
+
+    Args:
+        starts: upper three rows of the inverse bone transforms, [B, I, 12], posed to canonical.
+        divergence: residual at which a start is given up, metres.
+        exact_jacobian: whether the inverse Jacobian is the exact one at the root or the iteration's approximation.
+    """
+    points, transforms, starts = points.contiguous(), transforms.contiguous(), starts.contiguous()
+    settings = _Broyden(
+        starts.data_ptr(), starts.shape[1], tolerance, divergence, max_steps, exact_jacobian, orientation_preserving
+    )
+    return _search("snarf_broyden_search", _field(transforms, lower, size, shape), points, settings)
+
+
+def implicit_backward(
+    gradient: Tensor,
+    canonical: Tensor,
+    query: Tensor,
+    jacobian_inverse: Tensor,
+    lower: Tensor,
+    size: Tensor,
+    shape: tuple[int, int, int],
+    batch: int,
+    count: int,
+    wants: tuple[bool, bool],
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients by the queries [B, N, 3] and by the nodes' transforms [B, D * H * W, 12]; empty where not wanted.
+
+    Args:
+        gradient: of the loss by the roots, [M, 3]; the other arrays as the search returned them.
+        wants: which of the two results are needed.
+    """
+    gradient, canonical = gradient.contiguous(), canonical.contiguous()
+    query, jacobian_inverse = query.contiguous(), jacobian_inverse.contiguous()
+    v_points = gradient.new_empty((batch, count, 3) if wants[0] else 0)
+    v_transforms = gradient.new_empty((batch, shape[0] * shape[1] * shape[2], 12) if wants[1] else 0)
+    field = _field(gradient, lower, size, shape)
+    queries = _Queries(None, batch, count, torch.get_num_threads())
+    code = _library().snarf_implicit_backward(
+        byref(field),
+        byref(queries),
+        c_int64(len(query)),
+        c_void_p(gradient.data_ptr()),
+        c_void_p(canonical.data_ptr()),
+        c_void_p(query.data_ptr()),
+        c_void_p(jacobian_inverse.data_ptr()),
+        c_void_p(v_points.data_ptr() if wants[0] else None),
+        c_void_p(v_transforms.data_ptr() if wants[1] else None),
+    )
+    _raise_for(code)
+    return v_points, v_transforms
+
+
+def _library() -> ctypes.CDLL:
+    library = native_library()
+    if library is None:
+        raise RuntimeError("the native library is not available")
+    return library
+
+
+def _field(numbers: Tensor, lower: Tensor, size: Tensor, shape: tuple[int, int, int]) -> _Field:
+    """Describe the grid; `numbers` [B, V, 12] gives the address and the type."""
+    nodes = (c_int32 * 3)(shape[2], shape[1], shape[0])
+    return _Field(
+        numbers.data_ptr(), (c_double * 3)(*lower.tolist()), (c_double * 3)(*size.tolist()), nodes, numbers.element_size()
+    )
+
+
+def _search(function: str, field: _Field, points: Tensor, settings: Structure) -> tuple[Tensor, Tensor, Tensor]:
+    library = _library()
+    queries = _Queries(points.data_ptr(), points.shape[0], points.shape[1], torch.get_num_threads())
+    handle, found = c_void_p(), c_int64()
+    _raise_for(getattr(library, function)(byref(field), byref(queries), byref(settings), byref(handle), byref(found)))
+    canonical = points.new_empty(found.value, 3)
+    inverse = points.new_empty(found.value, 3, 3)
+    query = torch.empty(found.value, dtype=torch.long)
+    _raise_for(
+        library.snarf_take_roots(
+            handle, c_void_p(canonical.data_ptr()), c_void_p(query.data_ptr()), c_void_p(inverse.data_ptr())
+        )
+    )
+    return canonical, query, inverse
+
+
+def _raise_for(code: int) -> None:
+    if code == 2:
+        raise MemoryError("the correspondence search ran out of memory; give fewer points or poses at once")
+    if code:
+        raise RuntimeError(f"the native library refused its arguments (code {code})")

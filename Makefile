@@ -6,6 +6,7 @@ VENV := $(or $(VIRTUAL_ENV),.venv)
 INSTALLED := $(VENV)/.snarf-installed
 SNARF := $(VENV)/bin/snarf
 SUBJECT ?= 50002
+NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
 
 .PHONY: help setup demo test lint bench clean
 
@@ -19,7 +20,7 @@ help:
 
 setup: $(INSTALLED)
 
-$(INSTALLED): pyproject.toml tools/set_up.sh
+$(INSTALLED): pyproject.toml tools/set_up.sh CMakeLists.txt $(NATIVE)
 	PYTHON=$(PYTHON) tools/set_up.sh $(VENV)
 
 demo: $(INSTALLED)

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import zipfile
-from pathlib import Path
-
 import pytest
 
 from snarfcli import cli
 from snarfcli.errors import UserError
 from snarfcli.settings import describe, group_schemas, setting_names
 
-ROOT = Path(__file__).parents[1]
 COMMANDS = ("preprocess", "train", "eval", "animate")
 
 
@@ -158,24 +152,3 @@ def test_setting_names_are_dotted():
 
     names = setting_names(TrainConfig)
     assert {"subject", "training", "training.steps", "search.init_bones"} <= set(names)
-
-
-def test_wheel_holds_configuration_and_body_and_runs_from_anywhere(elsewhere):
-    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(elsewhere), str(ROOT)]
-    subprocess.run(build, check=True, capture_output=True)
-    (wheel,) = elsewhere.glob("snarf-*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        names = archive.namelist()
-        archive.extractall(elsewhere / "site")
-    wanted = {f"snarfcli/conf/{path.relative_to(ROOT / 'conf')}" for path in (ROOT / "conf").rglob("*.yaml")}
-    assert wanted and wanted <= set(names)
-    assert "snarfcli/bodies/body_cc0.npz" in names
-    assert not [name for name in names if name.startswith(("tests", "benchmarks", "tools", "data"))]
-    code = (
-        "import sys; sys.path.insert(0, 'site'); import snarfcli; assert 'site' in snarfcli.__file__; "
-        "from snarfcli.bodies import builtin_body; assert len(builtin_body().v_template) == 6890; "
-        "from snarfcli.cli import main; raise SystemExit(main(['train', '--cfg', 'job']))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=elsewhere, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "subject: '50002'" in done.stdout

@@ -75,6 +75,14 @@ _COMMANDS = (
         "snarf animate --pose seq.npz subject=50002",
         {"--pose": "pose={}"},
     ),
+    Command(
+        "doctor",
+        "doctor",
+        "DoctorConfig",
+        "versions, what runs natively and what does not, and why",
+        "snarf doctor",
+        {},
+    ),
 )
 COMMANDS = {command.name: command for command in _COMMANDS} | {"evaluate": _COMMANDS[2]}
 
@@ -290,7 +298,8 @@ def _overview() -> str:
     return (
         "snarf learns an animatable avatar of one subject from posed meshes.\n\n"
         f"usage: snarf COMMAND [FLAGS] [SETTING=VALUE ...]\n\n{rows}\n\n"
-        "Work through them in this order. \"snarf COMMAND --help\" tells more, \"snarf --version\" the version."
+        "Work through the first four in this order; doctor says what this machine has. "
+        "\"snarf COMMAND --help\" tells more, \"snarf --version\" the version."
     )
 
 

@@ -1,0 +1,203 @@
+"""`snarf doctor`: what is installed, what runs natively, and where a fallback runs instead and why."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from omegaconf import MISSING
+
+import snarfcli
+
+__all__ = ["DoctorConfig", "Finding", "run"]
+
+log = logging.getLogger(__name__)
+
+_LISTED = 8  # names of data or runs on one line; a long list helps nobody
+
+
+@dataclass
+class DoctorConfig:
+    """Settings of `snarf doctor`."""
+
+    data_root: str = MISSING
+    """Folder to look for data and processed samples in."""
+    output_root: str = MISSING
+    """Folder to look for trained avatars in."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    name: str
+    text: str
+    is_fallback: bool = False
+    """Whether something slower, or nothing, takes the place of what is described."""
+
+
+def run(config: DoctorConfig) -> int:
+    """Print what is there. A broken part is reported like any other: the other parts are still looked at.
+
+    Returns:
+        0, also where fallbacks are in use.
+    """
+    sections: dict[str, Callable[[], Iterator[Finding]]] = {
+        "versions": _versions,
+        "processor": _processor,
+        "GPU": _gpu,
+        "tools": _tools,
+        "data": lambda: _data(Path(config.data_root), Path(config.output_root)),
+    }
+    fallbacks: list[str] = []
+    for title, look in sections.items():
+        log.info("%s", title)
+        for finding in _survey(look):
+            log.info("  %-16s%s", finding.name, finding.text)
+            if finding.is_fallback:
+                fallbacks.append(finding.name)
+    log.info("")
+    log.info("%s", f"fallbacks or missing parts: {', '.join(fallbacks)} (see above)" if fallbacks else "nothing is missing")
+    return 0
+
+
+def _survey(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """Yield the findings of a section, the last one being the error that ended it, if any."""
+    try:
+        yield from look()
+    except Exception as error:  # a broken installation is what this command is for
+        yield Finding("error", _one_line(error), is_fallback=True)
+
+
+def _one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def _versions() -> Iterator[Finding]:
+    yield Finding("snarf", f"{snarfcli.__version__}, {Path(snarfcli.__file__).parent}")
+    yield Finding("python", f"{platform.python_version()}, {sys.executable}")
+    yield Finding("platform", f"{platform.platform()}, {platform.machine()}")
+    yield _package("torch", "torch", "torch")
+    for package in ("numpy", "scipy", "scikit-image", "trimesh", "hydra-core", "tensorboard"):
+        yield _package(package, package)
+
+
+def _package(name: str, package: str, module: str | None = None) -> Finding:
+    """Return the version of an installed package; with `module`, whether that can be imported."""
+    try:
+        installed = version(package)
+        if module is not None:
+            importlib.import_module(module)
+    except PackageNotFoundError:
+        return Finding(name, f'not installed; run "pip install {package}"', is_fallback=True)
+    except Exception as error:
+        return Finding(name, f"{package} {installed} cannot be imported: {_one_line(error)}", is_fallback=True)
+    return Finding(name, f"{package} {installed}" if name != package else installed)
+
+
+def _processor() -> Iterator[Finding]:
+    from snarfcli.runs import machine_facts
+
+    machine = machine_facts()["machine"]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else machine["cores"]
+    yield Finding("model", f"{machine['processor']}, {machine['cores']} cores, {usable} of them usable here")
+    limit = os.environ.get("OMP_NUM_THREADS")
+    yield Finding("threads", f"{machine['threads']} (PyTorch's number{f'; OMP_NUM_THREADS={limit}' if limit else ''})")
+    yield _native()
+
+
+def _native() -> Finding:
+    """Return whether the native search runs, or why not."""
+    from snarfcli.deformer.library import build_note, instruction_set, library_path, why_unavailable
+
+    reason = why_unavailable()
+    if reason is not None:
+        return Finding("native search", f"not available, the reference in PyTorch is used: {reason}", is_fallback=True)
+    note = build_note() if "SNARF_NATIVE_LIBRARY" not in os.environ else {}
+    built = f", built by {note['compiler']} for {', '.join(note['instruction_sets'])}" if note.get("built") else ""
+    return Finding("native search", f"active, {instruction_set()}, {library_path()}{built}")
+
+
+def _gpu() -> Iterator[Finding]:
+    import torch
+
+    count = torch.cuda.device_count()
+    yield Finding("PyTorch", f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA")
+    yield Finding("devices", "none; everything runs on the processor" if not count else f"{count}")
+    for index in range(count):
+        device = torch.cuda.get_device_properties(index)
+        memory = f"{device.total_memory / 2**30:.1f} GiB"
+        yield Finding(f"cuda:{index}", f"{device.name}, {memory}, compute capability {device.major}.{device.minor}")
+    yield _nvrtc(needed=count > 0)
+    try:
+        status = importlib.import_module("snarfcli.deformer.cuda").cuda_status()
+    except ModuleNotFoundError as error:
+        if error.name != "snarfcli.deformer.cuda":
+            raise
+        status = "none in this version"
+    yield Finding("CUDA kernels", status)
+
+
+def _nvrtc(needed: bool) -> Finding:
+    """Return the version of the compiler of CUDA kernels; without a GPU its absence is no lack."""
+    try:
+        nvrtc = importlib.import_module("cuda.bindings.nvrtc")
+        error, major, minor = nvrtc.nvrtcVersion()
+        if int(error) != 0:
+            raise RuntimeError(f"nvrtcVersion gave error {int(error)}")
+    except ModuleNotFoundError:
+        advice = '; run "pip install cuda-bindings"' if needed else ", not needed without a GPU"
+        return Finding("NVRTC", f"no cuda.bindings{advice}", is_fallback=needed)
+    except Exception as error:
+        return Finding("NVRTC", f"cannot be used: {_one_line(error)}", is_fallback=needed)
+    return Finding("NVRTC", f"{major}.{minor}, cuda-bindings {version('cuda-bindings')}")
+
+
+def _tools() -> Iterator[Finding]:
+    yield _ffmpeg()
+    yield _package("embree", "embreex", "embreex.rtcore_scene")
+    yield _package("libigl", "libigl", "igl")
+    yield _package("pymeshlab", "pymeshlab", "pymeshlab")
+
+
+def _ffmpeg() -> Finding:
+    """Return which ffmpeg writes videos."""
+    try:
+        import imageio_ffmpeg
+
+        return Finding("ffmpeg", f"{imageio_ffmpeg.get_ffmpeg_version()}, {imageio_ffmpeg.get_ffmpeg_exe()}")
+    except Exception as error:
+        text = f'none ({_one_line(error)}); videos cannot be written; run "pip install imageio-ffmpeg"'
+        return Finding("ffmpeg", text, is_fallback=True)
+
+
+def _data(data_root: Path, output_root: Path) -> Iterator[Finding]:
+    if data_root.is_dir():
+        folders = sorted(path.name for path in data_root.iterdir() if path.is_dir() and path.name != "processed")
+        yield Finding("data_root", f"{data_root.absolute()}, folders: {_listed(folders)}")
+    else:
+        yield Finding("data_root", f"no folder {data_root.absolute()}; data=builtin needs none")
+    samples = _names(data_root / "processed", "*/*/manifest.json")
+    yield Finding("samples", _listed(samples, 'run "snarf preprocess"'))
+    avatars = _names(output_root, "*/*/*/avatar.pt")
+    yield Finding("avatars", _listed(avatars, 'run "snarf train"'))
+
+
+def _names(root: Path, pattern: str) -> list[str]:
+    """Return the folders below `root` that hold files of a pattern."""
+    return sorted(path.parent.relative_to(root).as_posix() for path in root.glob(pattern))
+
+
+def _listed(names: Sequence[str], advice: str = "") -> str:
+    """Return names as one line."""
+    if not names:
+        return f"none; {advice}" if advice else "none"
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more

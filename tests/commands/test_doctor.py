@@ -1,0 +1,83 @@
+"""`snarf doctor`: it tells what is there and what is not, and ends well on a broken machine too."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from snarfcli import cli
+from snarfcli.commands import doctor
+from snarfcli.commands.doctor import DoctorConfig
+from snarfcli.deformer import library
+
+
+def report(caplog, data_root, output_root) -> dict[str, str]:
+    """Run the command on two folders; return its lines by name."""
+    caplog.set_level("INFO", logger="snarfcli")
+    assert doctor.run(DoctorConfig(str(data_root), str(output_root))) == 0
+    lines = [record.getMessage() for record in caplog.records]
+    return {line[2:18].strip(): line[18:] for line in lines if line.startswith("  ")} | {"end": lines[-1]}
+
+
+@pytest.fixture
+def broken_library(monkeypatch):
+    monkeypatch.setenv("SNARF_NATIVE_LIBRARY", "/nowhere/lib.so")
+    library._load.cache_clear()
+    yield
+    monkeypatch.undo()
+    library._load.cache_clear()
+
+
+def test_everything_is_told(caplog, tmp_path):
+    import torch
+
+    lines = report(caplog, tmp_path / "data", tmp_path / "outputs")
+    assert lines["torch"] == torch.__version__
+    assert lines["threads"].startswith(f"{torch.get_num_threads()} ")
+    assert lines["native search"].startswith(f"active, {library.instruction_set()}, {library.library_path()}")
+    assert "no folder" in lines["data_root"] and "snarf preprocess" in lines["samples"] and "snarf train" in lines["avatars"]
+    others = {"snarf", "python", "platform", "numpy", "model", "devices", "NVRTC", "CUDA kernels", "ffmpeg", "embree", "libigl"}
+    assert others <= set(lines)
+
+
+def test_data_and_avatars_are_found(caplog, tmp_path):
+    for file in ("data/dfaust/x", "data/processed/builtin/50002/manifest.json", "outputs/builtin/50002/demo/avatar.pt"):
+        (tmp_path / file).parent.mkdir(parents=True)
+        (tmp_path / file).touch()
+    lines = report(caplog, tmp_path / "data", tmp_path / "outputs")
+    assert lines["data_root"].endswith("folders: dfaust")
+    assert lines["samples"] == "builtin/50002" and lines["avatars"] == "builtin/50002/demo"
+
+
+def test_a_fallback_is_named_with_its_reason(caplog, tmp_path, broken_library):
+    lines = report(caplog, tmp_path, tmp_path)
+    assert lines["native search"].startswith("not available, the reference in PyTorch is used: SNARF_NATIVE_LIBRARY names")
+    assert "native search" in lines["end"]
+
+
+def test_many_names_are_cut():
+    names = [str(number) for number in range(20)]
+    assert doctor._listed(names) == "0, 1, 2, 3, 4, 5, 6, 7 and 12 more"
+
+
+def test_a_broken_section_does_not_end_the_report(caplog, tmp_path, monkeypatch):
+    monkeypatch.setattr(doctor, "_native", lambda: 1 / 0)
+    lines = report(caplog, tmp_path, tmp_path)
+    assert lines["error"] == "ZeroDivisionError: division by zero"
+    assert "libigl" in lines and "error" in lines["end"]
+
+
+def test_it_runs_without_pytorch(tmp_path):
+    code = "import sys; sys.modules['torch'] = None; from snarfcli.cli import main; raise SystemExit(main(['doctor']))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "cannot be imported" in done.stdout and "libigl" in done.stdout and "Traceback" not in done.stdout + done.stderr
+
+
+def test_as_a_command(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["doctor", "data_root=elsewhere"]) == 0
+    assert cli.main(["doctor", "data_rot=x"]) == 2
+    assert "did you mean 'data_root'" in capsys.readouterr().err

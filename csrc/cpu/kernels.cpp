@@ -33,7 +33,7 @@ template <class S> struct Part {
 
 template <class S> struct Search {
   const CompleteTask<S>& task;
-  Scratch& scratch;
+  Scratch<S>& scratch;
   RootSink<S>& sink;
   S centre[3];  // canonical centre of the cell
   int32_t cell;
@@ -75,6 +75,71 @@ template <class S> void load_cells(const S* transforms, const Geometry<S>& geome
   centre[2] = V(geometry.lower[2] + (S(z) + S(0.5)) * geometry.size[2]);
   cell_from_corners(corner, centre, geometry.size, out.cell);
   bound_cell<V, S>(out.cell, out.bounds);
+}
+
+// Numbers that repeat with the period of x, y, z over three packs of lanes, as `points` [N, 3] do.
+template <class S> void spread(const S* xyz, Lanes<S>* out) {
+  constexpr int width = Lanes<S>::width;
+  S values[3 * width];
+  for (int k = 0; k < 3 * width; ++k) values[k] = xyz[k % 3];
+  for (int i = 0; i < 3; ++i) out[i] = load<S>(values + i * width);
+}
+
+template <class S> void extent(const S* points, int64_t count, S* lower, S* upper) {
+  using V = Lanes<S>;
+  constexpr int width = V::width;
+  V low[3], high[3];
+  spread(lower, low);
+  spread(upper, high);
+  int64_t n = 0;
+  for (; n + width <= count; n += width)
+    for (int i = 0; i < 3; ++i) {
+      const V value = load<S>(points + 3 * n + i * width);
+      low[i] = select(value < low[i], value, low[i]);
+      high[i] = select(value > high[i], value, high[i]);
+    }
+  const auto widen = [&](int axis, S least, S most) {
+    if (least < lower[axis]) lower[axis] = least;
+    if (most > upper[axis]) upper[axis] = most;
+  };
+  for (int k = 0; k < 3 * width; ++k) widen(k % 3, low[k / width][k % width], high[k / width][k % width]);
+  for (; n < count; ++n)
+    for (int i = 0; i < 3; ++i) widen(i, points[3 * n + i], points[3 * n + i]);
+}
+
+template <class S> void bins(const SortedQueries<S>& queries, const S* points, int64_t count, int32_t* bin) {
+  using V = Lanes<S>;
+  constexpr int width = V::width;
+  const S per_metre[3] = {queries.per_metre, queries.per_metre, queries.per_metre};
+  // Products of bins and strides stay below 2^24, where a float still holds every integer.
+  const S last[3] = {S(queries.bins[0] - 1), S(queries.bins[1] - 1), S(queries.bins[2] - 1)};
+  const S stride[3] = {S(1), S(queries.bins[0]), S(queries.bins[0]) * S(queries.bins[1])};
+  const V outside = V(S(-1e9)), zero = V(S(0));
+  V lower[3], upper[3], scale[3], most[3], by[3];
+  spread(queries.lower, lower);
+  spread(queries.upper, upper);
+  spread(per_metre, scale);
+  spread(last, most);
+  spread(stride, by);
+  for (int64_t n = 0; n < count; n += width) {
+    const int here = count - n < width ? int(count - n) : width;
+    S part[3 * width];
+    if (here < width) {
+      for (int k = 0; k < 3 * width; ++k) part[k] = k < 3 * here ? points[3 * n + k] : queries.lower[0];
+    }
+    const S* const from = here < width ? part : points + 3 * n;
+    V share[3];
+    for (int i = 0; i < 3; ++i) {
+      const V value = load<S>(from + i * width);
+      const V at = truncate(smaller(larger((value - lower[i]) * scale[i], zero), most[i]));
+      share[i] = select((value >= lower[i]) & (value <= upper[i]), at * by[i], outside);
+    }
+    for (int i = 0; i < 3; ++i) store(part + i * width, share[i]);
+    for (int k = 0; k < here; ++k) {
+      const S sum = part[3 * k] + part[3 * k + 1] + part[3 * k + 2];
+      bin[n + k] = sum < 0 ? -1 : int32_t(sum);
+    }
+  }
 }
 
 template <class S> void boxes(const S* transforms, const Geometry<S>& geometry, const Block* blocks, int64_t count, BlockBoxes<S>* out) {
@@ -132,24 +197,14 @@ template <class S> struct Test {
   }
 };
 
-// Coordinates of up to `width` queries by their places; lanes beyond `count` repeat the first.
-template <class S> void fetch(const SortedQueries<S>& queries, const int32_t* places, int count, Lanes<S>* out) {
-  constexpr int width = Lanes<S>::width;
-  for (int i = 0; i < 3; ++i) {
-    S values[width];
-    for (int k = 0; k < width; ++k) values[k] = queries.at[i][places[k < count ? k : 0]];
-    out[i] = load<S>(values);
-  }
-}
-
 template <class S>
-void emit(Search<S>& search, const Part<S>& part, const int32_t* places, uint32_t found, const Lanes<S>* s, const Lanes<S>* inverse) {
+void emit(Search<S>& search, const Part<S>& part, const int32_t* queries, uint32_t found, const Lanes<S>* s, const Lanes<S>* inverse) {
   const Geometry<S>& geometry = search.task.geometry;
   for (; found; found &= found - 1) {
     const int lane = lowest_bit(found);
     if (search.sink.next == search.sink.end) search.sink.more(&search.sink);
     Root<S>& root = *search.sink.next;
-    root.query = search.task.queries.query[places[lane]];
+    root.query = queries[lane];
     root.order = search.cell;
     for (int i = 0; i < 3; ++i) {
       root.canonical[i] = search.centre[i] + geometry.size[i] * (part.shift[i] + part.scale * s[i][lane]);
@@ -160,42 +215,57 @@ void emit(Search<S>& search, const Part<S>& part, const int32_t* places, uint32_
   }
 }
 
-// Newton's method for all candidates of a part. With `corner` < 8 it starts from that corner, with 8 from the centre, with 9 from
-// the affine guess.
-template <class S> void solve(Search<S>& search, const Part<S>& part, const int32_t* places, int64_t count, int start) {
+// Where Newton's method starts: a corner (0 to 7), the centre, or the root of the linearised cell.
+enum Start { kCentre = 8, kGuess = 9, kStarts = 10 };
+
+// Newton's method for `count` candidates of a part, which stand at `begin` in the scratch lists.
+template <class S> void solve(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count, int start) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   const Solver<S> solver{search.task.tolerance, search.task.max_steps};
   const S reach = S(0.5) + face_tolerance<S>() / part.scale;
-  for (int64_t first = 0; first < count; first += width) {
-    const int here = count - first < width ? int(count - first) : width;
+  for (int64_t first = begin; first < begin + count; first += width) {
+    const int here = begin + count - first < width ? int(begin + count - first) : width;
     V offset[3], s[3], inverse[9];
-    fetch(search.task.queries, places + first, here, offset);
-    for (int i = 0; i < 3; ++i) offset[i] = offset[i] - part.c[kMonomials * i];
+    for (int i = 0; i < 3; ++i) offset[i] = load<S>(search.scratch.at[i] + first) - part.c[kMonomials * i];
     for (int i = 0; i < 3; ++i) {
-      if (start == 9) {
+      if (start == kGuess) {
         const V guess = offset[0] * part.inverse[3 * i] + offset[1] * part.inverse[3 * i + 1] + offset[2] * part.inverse[3 * i + 2];
         s[i] = smaller(larger(guess, V(S(-0.5))), V(S(0.5)));
       } else {
-        s[i] = V(start == 8 ? S(0) : start >> i & 1 ? S(0.5) : S(-0.5));
+        s[i] = V(start == kCentre ? S(0) : start >> i & 1 ? S(0.5) : S(-0.5));
       }
     }
     for (int i = 0; i < 9; ++i) inverse[i] = V(S(0));
     const LaneMask<S> found = solve_in_cell(part.c, offset, first_lanes<S>(here), solver, reach, s, inverse);
-    emit(search, part, places + first, bits(found), s, inverse);
+    emit(search, part, search.scratch.query + first, bits(found), s, inverse);
   }
 }
 
-// Finds the roots in a part for `count` candidates, which stand at `begin` in the scratch list; what follows them is free.
+// Appends the lanes in `inside` of the candidates at x, y, z to the scratch lists; returns the new end.
+template <class S>
+SNARF_HD int64_t append(Scratch<S>& scratch, int64_t end, uint32_t inside, const S* x, const S* y, const S* z, const int32_t* query) {
+  for (; inside; inside &= inside - 1, ++end) {
+    const int lane = lowest_bit(inside);
+    scratch.at[0][end] = x[lane];
+    scratch.at[1][end] = y[lane];
+    scratch.at[2][end] = z[lane];
+    scratch.query[end] = query[lane];
+  }
+  return end;
+}
+
+// Finds the roots in a part for `count` candidates, which stand at `begin` in the scratch lists; what follows them is free.
 template <class S> void search_part(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count) {
   using V = Lanes<S>;
   constexpr int width = V::width;
-  if (part.curvature < S(kTame)) return solve(search, part, search.scratch.data + begin, count, 9);
+  if (part.curvature < S(kTame)) return solve(search, part, begin, count, kGuess);
   if (part.level == kLevels) {
-    for (int start = 0; start < 10; ++start) solve(search, part, search.scratch.data + begin, count, start);
+    for (int start = 0; start < kStarts; ++start) solve(search, part, begin, count, start);
     return;
   }
-  search.scratch.reserve(&search.scratch, begin + 2 * count);
+  Scratch<S>& scratch = search.scratch;
+  scratch.reserve(&scratch, begin + 2 * count);
   CellLanes<S> whole, parts;
   for (int m = 0; m < 3 * kMonomials; ++m) whole.cell.c[m] = V(part.c[m]);
   for (int eighth = 0; eighth < 8; eighth += width) {
@@ -214,16 +284,14 @@ template <class S> void search_part(Search<S>& search, const Part<S>& part, int6
       child.scale = part.scale * S(0.5);
       for (int i = 0; i < 3; ++i) child.shift[i] = part.shift[i] + part.scale * shift[i][lane];
       const Test<S> test(child);
-      int32_t* const places = search.scratch.data + begin;
-      int64_t kept = 0;
-      for (int64_t first = 0; first < count; first += width) {
-        const int here = count - first < width ? int(count - first) : width;
-        V at[3];
-        fetch(search.task.queries, places + first, here, at);
-        for (uint32_t inside = bits(test(at[0], at[1], at[2]) & first_lanes<S>(here)); inside; inside &= inside - 1)
-          places[count + kept++] = places[first + lowest_bit(inside)];
+      int64_t end = begin + count;
+      for (int64_t first = begin; first < begin + count; first += width) {
+        const int here = begin + count - first < width ? int(begin + count - first) : width;
+        const S *const x = scratch.at[0] + first, *const y = scratch.at[1] + first, *const z = scratch.at[2] + first;
+        const uint32_t inside = bits(test(load<S>(x), load<S>(y), load<S>(z))) & ((uint32_t(2) << (here - 1)) - 1);
+        end = append(scratch, end, inside, x, y, z, scratch.query + first);
       }
-      if (kept) search_part(search, child, begin + count, kept);
+      if (end > begin + count) search_part(search, child, begin + count, end - begin - count);
     }
   }
 }
@@ -234,7 +302,7 @@ template <class S> int32_t bin_of(const SortedQueries<S>& queries, int axis, S p
 }
 
 template <class S>
-void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>& boxes, Scratch& scratch, RootSink<S>& sink) {
+void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>& boxes, Scratch<S>& scratch, RootSink<S>& sink) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   const SortedQueries<S>& queries = task.queries;
@@ -269,24 +337,25 @@ void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>
       part.scale = 1;
       part.shift[0] = part.shift[1] = part.shift[2] = 0;
       const Test<S> test(part);
-      int64_t kept = 0;
+      int64_t end = 0;
       for (int32_t z = low[2]; z <= high[2]; ++z)
         for (int32_t y = low[1]; y <= high[1]; ++y) {
           const int64_t row = (int64_t(z) * queries.bins[1] + y) * queries.bins[0];
-          const int32_t end = queries.begin[row + high[0] + 1];
-          for (int32_t i = queries.begin[row + low[0]]; i < end; i += width) {
-            uint32_t inside = bits(test(load<S>(queries.at[0] + i), load<S>(queries.at[1] + i), load<S>(queries.at[2] + i)));
-            if (end - i < width) inside &= (1u << (end - i)) - 1;
-            for (; inside; inside &= inside - 1) scratch.data[kept++] = i + lowest_bit(inside);
+          const int32_t last = queries.begin[row + high[0] + 1];
+          for (int32_t i = queries.begin[row + low[0]]; i < last; i += width) {
+            const S *const px = queries.at[0] + i, *const py = queries.at[1] + i, *const pz = queries.at[2] + i;
+            uint32_t inside = bits(test(load<S>(px), load<S>(py), load<S>(pz)));
+            if (last - i < width) inside &= (1u << (last - i)) - 1;
+            end = append(scratch, end, inside, px, py, pz, queries.query + i);
           }
         }
-      if (!kept) continue;
+      if (!end) continue;
       const int32_t x = block.x + k;
       Search<S> here{task, scratch, sink, {}, 0};
       here.cell = int32_t((int64_t(block.z) * (task.geometry.nodes[1] - 1) + block.y) * (task.geometry.nodes[0] - 1) + x);
       const int32_t index[3] = {x, block.y, block.z};
       for (int i = 0; i < 3; ++i) here.centre[i] = task.geometry.lower[i] + (S(index[i]) + S(0.5)) * task.geometry.size[i];
-      search_part(here, part, 0, kept);
+      search_part(here, part, 0, end);
     }
   }
 }
@@ -354,7 +423,7 @@ template <class S> void backward(const BackwardTask<S>& task) {
 
 }  // namespace
 
-template <class S> Kernels<S> kernels() { return {boxes<S>, search<S>, broyden_queries<S>, backward<S>}; }
+template <class S> Kernels<S> kernels() { return {extent<S>, bins<S>, boxes<S>, search<S>, broyden_queries<S>, backward<S>}; }
 template Kernels<float> kernels<float>();
 template Kernels<double> kernels<double>();
 

@@ -48,9 +48,10 @@ template <class S> struct RootSink {
   void (*more)(RootSink*);
 };
 
-// A growing list of candidate queries, by their place in the sorted order; `reserve` makes room for at least `count`.
-struct Scratch {
-  int32_t* data;
+// Growing lists of candidate queries: their coordinates, and which they are. `reserve` makes room for `count` and kBlock more.
+template <class S> struct Scratch {
+  S* at[3];
+  int32_t* query;
   int64_t capacity;
   void* owner;
   void (*reserve)(Scratch*, int64_t count);
@@ -89,10 +90,14 @@ template <class S> struct BackwardTask {
 };
 
 template <class S> struct Kernels {
+  // Widens the box lower[3], upper[3] to hold `count` points [N, 3]; NaN is passed over.
+  void (*extent)(const S* points, int64_t count, S* lower, S* upper);
+  // Which bin each of `count` points [N, 3] lies in; -1 outside of the bins' region.
+  void (*bins)(const SortedQueries<S>&, const S* points, int64_t count, int32_t* bin);
   // Fills the boxes of `count` blocks.
   void (*boxes)(const S* transforms, const Geometry<S>&, const Block*, int64_t count, BlockBoxes<S>*);
   // Finds the roots in one block's cells.
-  void (*search)(const CompleteTask<S>&, const Block&, const BlockBoxes<S>&, Scratch&, RootSink<S>&);
+  void (*search)(const CompleteTask<S>&, const Block&, const BlockBoxes<S>&, Scratch<S>&, RootSink<S>&);
   // Runs Broyden's method for the queries first to last.
   void (*broyden)(const BroydenTask<S>&, int64_t first, int64_t last, int32_t query_offset, RootSink<S>&);
   void (*backward)(const BackwardTask<S>&);

@@ -139,6 +139,17 @@ template <class S> SNARF_HD Lanes<S> larger(Lanes<S> a, Lanes<S> b) { return sel
 template <class S> SNARF_HD Lanes<S> smaller(Lanes<S> a, Lanes<S> b) { return select(a < b, a, b); }
 template <class S> SNARF_HD Lanes<S> absolute(Lanes<S> a) { return larger(a, Lanes<S>(S(0)) - a); }
 
+// Rounded towards zero; for numbers that fit the integer of the same size.
+template <class S> SNARF_HD Lanes<S> truncate(Lanes<S> a) {
+#if defined(__GNUC__)
+  return {__builtin_convertvector(__builtin_convertvector(a.v, typename LaneMask<S>::Vector), typename Lanes<S>::Vector)};
+#else
+  Lanes<S> out;
+  for (int i = 0; i < Lanes<S>::width; ++i) out.v.at[i] = S(typename IntegerOf<S>::type(a.v.at[i]));
+  return out;
+#endif
+}
+
 // One bit per lane, lane 0 lowest.
 template <class S> SNARF_HD uint32_t bits(LaneMask<S> mask) {
 #if defined(__AVX512DQ__)

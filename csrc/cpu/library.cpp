@@ -25,7 +25,7 @@ namespace {
 
 constexpr int64_t kGroupQueries = int64_t(1) << 20;  // queries searched together: bounds the memory of the sort
 constexpr int64_t kGroupBlocks = int64_t(1) << 17;   // blocks of cells of all poses searched together: 50 MB of boxes
-constexpr double kBinPerBox = 0.75;                  // side of a bin, in mean sides of the posed boxes
+constexpr double kBinPerBox = 0.6;                  // side of a bin, in mean sides of the posed boxes
 constexpr double kSameRoot = 5e-3;                   // of a cell: two reports of one root; Newton's errors are far smaller
 constexpr double kSameBroydenRoot = 5e-2;            // of a cell: Broyden's roots are only as exact as the tolerance
 constexpr int64_t kQueriesPerThread = 2048;          // less is not worth starting a thread for
@@ -96,22 +96,28 @@ template <class S> class RootList {
   RootSink<S> sink_;
 };
 
-class ScratchList {
+template <class S> class ScratchLists {
  public:
-  ScratchList() : scratch_{nullptr, 0, this, reserve} {}
-  Scratch& scratch() { return scratch_; }
+  ScratchLists() : scratch_{{nullptr, nullptr, nullptr}, nullptr, 0, this, reserve} {}
+  Scratch<S>& scratch() { return scratch_; }
 
  private:
-  static void reserve(Scratch* scratch, int64_t count) {
+  static void reserve(Scratch<S>* scratch, int64_t count) {
     if (count <= scratch->capacity) return;
-    auto& values = static_cast<ScratchList*>(scratch->owner)->values_;
-    values.resize(size_t(std::max<int64_t>(2 * count, 4096)));
-    scratch->data = values.data();
-    scratch->capacity = int64_t(values.size());
+    ScratchLists& lists = *static_cast<ScratchLists*>(scratch->owner);
+    const size_t size = size_t(std::max<int64_t>(2 * count, 4096)) + kBlock;
+    for (int i = 0; i < 3; ++i) {
+      lists.at_[i].resize(size);
+      scratch->at[i] = lists.at_[i].data();
+    }
+    lists.query_.resize(size);
+    scratch->query = lists.query_.data();
+    scratch->capacity = int64_t(size) - kBlock;
   }
 
-  std::vector<int32_t> values_;
-  Scratch scratch_;
+  std::vector<S> at_[3];
+  std::vector<int32_t> query_;
+  Scratch<S> scratch_;
 };
 
 }  // namespace
@@ -127,6 +133,16 @@ struct snarf_roots {
 
 namespace snarf {
 namespace {
+
+constexpr int kAhead = 12;  // roots in the order of the queries lie anywhere in memory; fetching early hides most of the wait
+
+inline void prefetch(const void* at) {
+#if defined(__GNUC__)
+  __builtin_prefetch(at);
+#else
+  (void)at;
+#endif
+}
 
 // The roots of a group of consecutive queries, sorted.
 template <class S> struct Group {
@@ -157,6 +173,7 @@ template <class S> struct RootsOf final : snarf_roots {
       const bool well = run_phases(from.count > 4 * kQueriesPerThread ? threads : 1, {[&](int) {
         for (int64_t first, last; queue.take(first, last);)
           for (int64_t m = first; m < last; ++m) {
+            prefetch(from.sorted[std::min(m + kAhead, last - 1)]);
             const Root<S>& root = *from.sorted[m];
             q[m] = from.first_query + root.query;
             std::memcpy(x + 3 * m, root.canonical, sizeof root.canonical);
@@ -370,13 +387,8 @@ template <class S> class CompleteSearch {
       }
     for (int64_t part, end; extent_queue_.take(part, end);) {
       Extent<S> extent;
-      const S* const points = points_ + stride_ * (part / chunks_);
-      for (int64_t n = chunk_begin(part); n < chunk_begin(part, 1); ++n)
-        for (int i = 0; i < 3; ++i) {  // NaN compares false; infinities are left out below, where the boxes are finite
-          const S value = points[3 * n + i];
-          extent.lower[i] = value < extent.lower[i] ? value : extent.lower[i];
-          extent.upper[i] = value > extent.upper[i] ? value : extent.upper[i];
-        }
+      const int64_t first = chunk_begin(part);
+      kernels_.extent(points_ + stride_ * (part / chunks_) + 3 * first, chunk_begin(part, 1) - first, extent.lower, extent.upper);
       query_extents_[part] = extent;
     }
   }
@@ -467,18 +479,18 @@ template <class S> class CompleteSearch {
       const int64_t bins = bin_offset_[pose + 1] - bin_offset_[pose];
       int32_t* const histogram = histogram_.get() + bin_offset_[pose] * chunks_ + bins * (part % chunks_);
       const std::atomic<uint8_t>* const marked = marked_.get() + bin_offset_[pose];
-      const S* const points = points_ + stride_ * pose;
       int32_t* const key = key_.get() + pose * count_;
-      for (int64_t n = chunk_begin(part); n < chunk_begin(part, 1); ++n) {
-        const S* const p = points + 3 * n;
-        bool inside = bins > 0;
-        for (int i = 0; i < 3; ++i) inside &= p[i] >= sorted.lower[i] && p[i] <= sorted.upper[i];
-        key[n] = -1;
-        if (!inside) continue;
-        const int32_t at = (bin(sorted, 2, p[2]) * sorted.bins[1] + bin(sorted, 1, p[1])) * sorted.bins[0] + bin(sorted, 0, p[0]);
-        if (!marked[at].load(std::memory_order_relaxed)) continue;
-        key[n] = at;
-        ++histogram[at];
+      const int64_t first = chunk_begin(part), last = chunk_begin(part, 1);
+      if (!bins) {
+        std::fill(key + first, key + last, -1);
+        continue;
+      }
+      kernels_.bins(sorted, points_ + stride_ * pose + 3 * first, last - first, key + first);
+      for (int64_t n = first; n < last; ++n) {
+        const int32_t at = key[n];
+        if (at < 0) continue;
+        if (marked[at].load(std::memory_order_relaxed)) ++histogram[at];
+        else key[n] = -1;
       }
     }
   }
@@ -532,7 +544,7 @@ template <class S> class CompleteSearch {
   }
 
   void search(RootSink<S>& sink) {
-    ScratchList scratch;
+    ScratchLists<S> scratch;
     CompleteTask<S> task;
     task.geometry = geometry_;
     task.tolerance = S(settings_.tolerance);

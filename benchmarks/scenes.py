@@ -56,6 +56,8 @@ class Scene:
     """Whether canonical points [N, 3] are inside the canonical shape, bool [N]."""
     init_bones: tuple[int, ...]
     """Nine start bones (fewer where there are not as many)."""
+    mesh: tuple[np.ndarray, np.ndarray] | None = None
+    """Vertices [V, 3], metres, and faces of the canonical shape, where it is a mesh."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -207,6 +209,7 @@ def body_scene(pose: str, kind: str = "body's weights", resolution: tuple[int, i
         _surface_points(vertices, faces, 50_000),
         lambda points: winding_numbers(vertices, faces, points) > 0.5,
         NINE_BONES,
+        (vertices, faces),
     )
 
 

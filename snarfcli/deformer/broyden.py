@@ -82,29 +82,29 @@ def _iterate(
     """Run Broyden's method for each pair of query [S] and start [S, 3]; keep what converges inside the grid."""
     size = grid.cell_size(shape)
 
-    def evaluate(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
         cell, local = locate(x, grid, shape)
         corners = transforms.index_select(0, cell_corners(cell, shape).reshape(-1)).reshape(-1, 8, 12)
         posed, by_local = forward_jacobian(corners, local, x - local * size, size)
-        return posed, by_local / size, cell, local
+        return posed, by_local / size
 
     x = canonical.clamp(grid.lower, grid.upper)
     found = []
-    posed, first_jacobian, cell, local = evaluate(x) if len(x) else (x, x.new_empty(0, 3, 3), query, x)
+    posed, first_jacobian = evaluate(x) if len(x) else (x, x.new_empty(0, 3, 3))
     residual = posed - points[query]
     inverse = invert_3x3(first_jacobian)[0].nan_to_num(0, 0, 0)
     for step_number in range(max_steps + 1):
         distance = residual.norm(dim=1)
         converged = distance < tolerance
         done = converged.nonzero()[:, 0]
-        found.append((x[done], query[done], inverse[done], cell[done], local[done]))
+        found.append((x[done], query[done], inverse[done]))
         going = (~converged & (distance < divergence)).nonzero()[:, 0]
         if step_number == max_steps or not len(going):
             break
         query, x, residual, inverse = query[going], x[going], residual[going], inverse[going]
         moved = (x - torch.bmm(inverse, residual[:, :, None])[:, :, 0]).clamp(grid.lower, grid.upper)
         step, x = moved - x, moved
-        posed, _, cell, local = evaluate(x)
+        posed, _ = evaluate(x)
         change = posed - points[query] - residual
         residual = residual + change
         # Rank-one update of the inverse (Broyden 1965, "good" method by Sherman and Morrison).
@@ -113,7 +113,7 @@ def _iterate(
         scale = torch.bmm(step[:, None], towards)
         update = (step[:, :, None] - towards) @ row / scale
         inverse = inverse + torch.where(scale.abs() > 1e-20, update, 0.0)
-    x, query, inverse, cell, local = (torch.cat(parts) for parts in zip(*found, strict=True))
+    x, query, inverse = (torch.cat(parts) for parts in zip(*found, strict=True))
     if exact_jacobian and len(x):
         inverse = invert_3x3(evaluate(x)[1])[0]
-    return Roots(x, query, inverse, cell, local)
+    return Roots(x, query, inverse)

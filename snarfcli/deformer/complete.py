@@ -7,9 +7,10 @@ which all queries of a cell share; where it leads too far out of the cell for ho
 dropped. What remains, about three pairs for a root while an avatar trains, is solved with the exact Jacobian of the trilinear
 field. There are no start bones, and a query outside all boxes is known to have no correspondence at all.
 
-This is the readable version in PyTorch. Two things may be missed: a second root of the same query in one cell, where the
-determinant of the Jacobian changes sign and one start is not enough; and a root in a cell more curved between its corners than
-_CURVED and _SLACK allow for. tests/deformer/test_search.py compares with an exhaustive search.
+This is the readable version in PyTorch, the fallback where the native library is missing. Unlike that
+(csrc/include/snarf/cell.h) it may miss two things: a second root of the same query in one cell, where the determinant of the
+Jacobian changes sign and one start is not enough; and a root in a cell more curved between its corners than _CURVED and _SLACK
+allow for.
 """
 
 from __future__ import annotations
@@ -83,7 +84,6 @@ def complete_roots(
             roots = _newton(flat, query, cell, local, corner_transforms, places, size, tolerance, max_steps)
             width = max(queries.shape[1], 1)
             roots.query = (first + roots.query // width) * count + start + roots.query % width
-            roots.cell = cells[roots.cell % max(len(cells), 1)]
             parts.append(drop_duplicates(roots, _SAME_ROOT * float(size.min())))
     if not parts:
         nothing = cells[:0], cells[:0], points.new_empty(0, 3)
@@ -236,4 +236,4 @@ def _newton(
         going = (~converged & (from_centre - 0.5 < longest[:, 0].clamp_max(_STRAY))).nonzero()[:, 0]
         query, cell, local = (pairs.index_select(0, going) for pairs in (query, cell, local))
     query, cell, local, inverse = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return Roots(origins[cell] + local * cell_size, query, inverse, cell, local)
+    return Roots(origins[cell] + local * cell_size, query, inverse)

@@ -12,7 +12,6 @@ from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.ops import broyden_search, complete_search
 from snarfcli.deformer.search import invert_3x3
 from snarfcli.deformer.skinning import blend_transforms
-from snarfcli.precision import matmul_precision
 
 __all__ = ["Correspondences", "find_correspondences"]
 
@@ -104,11 +103,12 @@ def find_correspondences(
         max_steps: most steps for one start.
         divergence: residual at which a broyden start is given up, as a share of the grid's longest side.
         jacobian: "exact", or "broyden" for the approximate inverse of a broyden search (Fast-SNARF Eq. 15).
-        orientation_preserving: leave out roots where the Jacobian's determinant is negative: there the body is turned inside out.
+        orientation_preserving: leave out roots where the Jacobian's determinant is negative: there the body is inside out.
         backend: "native" (the compiled CPU library, CUDA kernels on a GPU), "reference" (PyTorch), or "auto" for native where
             it is there; a warning says once why it is not.
         capacity: most roots to return. The results then have this length whatever is found, so that a GPU need not be waited
-            for and the call can be captured in a CUDA graph; rows beyond the roots have the query B * N.
+            for and the call can be captured in a CUDA graph; rows beyond the roots have the query B * N. torch.compile with
+            fullgraph=True needs it too, or torch._dynamo.config.capture_dynamic_output_shape_ops.
         check: whether to look at the values of transforms and weights; on a GPU they are never looked at.
 
     Returns:
@@ -127,8 +127,7 @@ def find_correspondences(
         _check_values(bone_transforms, skinning_weights)
     grid = grid.to(points)
     depth, height, width = skinning_weights.shape[:3]
-    with matmul_precision("highest"):
-        transforms = blend_transforms(skinning_weights, bone_transforms)
+    transforms = blend_transforms(skinning_weights, bone_transforms)
     box = (grid.lower, grid.upper, [depth, height, width])
     common = (orientation_preserving, capacity, backend)
     if search == "complete":

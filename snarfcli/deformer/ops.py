@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.deformer import native
+from snarfcli.deformer.blending import refuse_second_derivative
 from snarfcli.deformer.broyden import broyden_roots
 from snarfcli.deformer.complete import complete_roots
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
@@ -96,7 +97,17 @@ def broyden_search(
     if choose_backend(backend) == "native":
         size = grid.cell_size(nodes)
         found = native.broyden_search(
-            points, transforms, starts, lower, size, nodes, tolerance, divergence, max_steps, exact_jacobian, orientation_preserving
+            points,
+            transforms,
+            starts,
+            lower,
+            size,
+            nodes,
+            tolerance,
+            divergence,
+            max_steps,
+            exact_jacobian,
+            orientation_preserving,
         )
     else:
         roots = broyden_roots(
@@ -256,13 +267,6 @@ def _backward(ctx, gradient, *_):
     return v_points if wants[0] else None, v_transforms if wants[1] else None, *rest
 
 
-def _refuse_second_derivative(ctx, *gradients):
-    raise RuntimeError(
-        "the second derivative of a correspondence search is not available: its gradient is exact, but is itself computed without "
-        "a graph; call backward() or autograd.grad() without create_graph=True"
-    )
-
-
 complete_search.register_autograd(_backward, setup_context=lambda ctx, inputs, output: _remember(ctx, inputs, output, 2))
 broyden_search.register_autograd(_backward, setup_context=lambda ctx, inputs, output: _remember(ctx, inputs, output, 3))
-implicit_backward.register_autograd(_refuse_second_derivative)
+implicit_backward.register_autograd(refuse_second_derivative)

@@ -27,7 +27,7 @@ class SearchConfig:
     orientation_preserving: bool = False
     """Whether roots are left out where the body is turned inside out (negative determinant of the Jacobian)."""
     backend: str = "auto"
-    """What computes: native (the compiled library or CUDA kernels), reference (PyTorch), or auto for native where it is there."""
+    """What computes: native (compiled library or CUDA kernels), reference (PyTorch), or auto: native where it is there."""
 
 
 @dataclass
@@ -40,15 +40,11 @@ class Roots:
     """Flat index b * N + n of each root's query, [M], ascending."""
     jacobian_inverse: Tensor
     """Inverse of dd/dx at the root, [M, 3, 3]."""
-    cell: Tensor
-    """Flat grid cell of each root, [M]."""
-    local: Tensor
-    """Coordinates in that cell, [M, 3]."""
 
     @classmethod
     def concatenate(cls, parts: list[Roots]) -> Roots:
         """Join the roots of consecutive queries."""
-        fields = ("canonical", "query", "jacobian_inverse", "cell", "local")
+        fields = ("canonical", "query", "jacobian_inverse")
         return cls(*(torch.cat([getattr(part, field) for part in parts]) for field in fields))
 
     def take(self, index: Tensor) -> Roots:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from snarfcli.deformer.blending import blend
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
 
 __all__ = ["blend_transforms", "forward_jacobian", "interpolate", "skin"]
@@ -40,7 +41,7 @@ def blend_transforms(skinning_weights: Tensor, bone_transforms: Tensor) -> Tenso
     Source: Fast-SNARF Eq. 13.
     """
     bones = bone_transforms[:, :, :3].reshape(*bone_transforms.shape[:2], 12)
-    return torch.matmul(skinning_weights.reshape(1, -1, skinning_weights.shape[-1]), bones)
+    return blend(skinning_weights.reshape(-1, skinning_weights.shape[-1]), bones)
 
 
 def interpolate(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:

@@ -50,22 +50,18 @@ template <class S> Grid<S> grid_of(const Geometry<S>& geometry) {
 }
 
 // Cells x .. x + width - 1 of a row, one a lane; beyond the end of the row the last node is repeated.
-template <class S> void load_cells(const S* transforms, const Geometry<S>& geometry, int x, int y, int z, CellLanes<S>& out) {
+template <class S> void load_cells(const S* transforms, const Geometry<S>& geometry, int x, int y, int z, Cell<Lanes<S>>& out) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   const int64_t row_nodes = geometry.nodes[0];
   V corner[8 * 12];
   for (int row = 0; row < 4; ++row) {
-    S columns[12][width + 1];
-    const S* nodes = transforms + 12 * ((int64_t(z + (row >> 1)) * geometry.nodes[1] + y + (row & 1)) * row_nodes);
-    for (int i = 0; i <= width; ++i) {
-      const S* node = nodes + 12 * (x + i < row_nodes ? x + i : row_nodes - 1);
-      for (int r = 0; r < 12; ++r) columns[r][i] = node[r];
-    }
-    for (int r = 0; r < 12; ++r) {
-      corner[(2 * row) * 12 + r] = load<S>(columns[r]);
-      corner[(2 * row + 1) * 12 + r] = load<S>(columns[r] + 1);
-    }
+    const S* const nodes = transforms + 12 * ((int64_t(z + (row >> 1)) * geometry.nodes[1] + y + (row & 1)) * row_nodes);
+    const S* node[width + 1];
+    for (int i = 0; i <= width; ++i) node[i] = nodes + 12 * (x + i < row_nodes ? x + i : row_nodes - 1);
+    V* const left = corner + 24 * row;
+    load_rows(node, left);
+    for (int r = 0; r < 12; ++r) left[12 + r] = shifted(left[r], node[width][r]);
   }
   V centre[3];
   S along[width];
@@ -73,8 +69,7 @@ template <class S> void load_cells(const S* transforms, const Geometry<S>& geome
   centre[0] = load<S>(along);
   centre[1] = V(geometry.lower[1] + (S(y) + S(0.5)) * geometry.size[1]);
   centre[2] = V(geometry.lower[2] + (S(z) + S(0.5)) * geometry.size[2]);
-  cell_from_corners(corner, centre, geometry.size, out.cell);
-  bound_cell<V, S>(out.cell, out.bounds);
+  cell_from_corners(corner, centre, geometry.size, out);
 }
 
 // Numbers that repeat with the period of x, y, z over three packs of lanes, as `points` [N, 3] do.
@@ -155,11 +150,13 @@ template <class S> void boxes(const S* transforms, const Geometry<S>& geometry, 
           out[n].upper[i][k] = S(-1);
         }
       if (!active) continue;
-      CellLanes<S> cells;
+      Cell<V> cells;
+      V box[3];
       load_cells(transforms, geometry, block.x + first, block.y, block.z, cells);
+      bound_box<V, S>(cells, box);
       for (int i = 0; i < 3; ++i)
         for (int k = 0; k < width; ++k) {
-          const S centre = cells.cell.c[kMonomials * i][k], extent = cells.bounds.box[i][k];
+          const S centre = cells.c[kMonomials * i][k], extent = box[i][k];
           const bool usable = extent < S(1e15) && centre - centre == 0;  // non-finite or absurd transforms give no root
           if (!(active >> k & 1) || !usable) continue;
           out[n].lower[i][first + k] = centre - extent;
@@ -265,9 +262,9 @@ template <class S> void search_part(Search<S>& search, const Part<S>& part, int6
     return;
   }
   Scratch<S>& scratch = search.scratch;
-  scratch.reserve(&scratch, begin + 2 * count);
-  CellLanes<S> whole, parts;
-  for (int m = 0; m < 3 * kMonomials; ++m) whole.cell.c[m] = V(part.c[m]);
+  const int64_t masks = begin + count, end = begin + 2 * count;
+  scratch.reserve(&scratch, begin + 3 * count);
+  CellLanes<S> parts;
   for (int eighth = 0; eighth < 8; eighth += width) {
     V shift[3];
     for (int i = 0; i < 3; ++i) {
@@ -275,23 +272,33 @@ template <class S> void search_part(Search<S>& search, const Part<S>& part, int6
       for (int k = 0; k < width; ++k) values[k] = (eighth + k) >> i & 1 ? S(0.25) : S(-0.25);
       shift[i] = load<S>(values);
     }
-    halve_cell<V, S>(whole.cell, shift, parts.cell);
+    Cell<V> whole;
+    for (int m = 0; m < 3 * kMonomials; ++m) whole.c[m] = V(part.c[m]);
+    halve_cell<V, S>(whole, shift, parts.cell);
     bound_cell<V, S>(parts.cell, parts.bounds);
+    // Which eighths may hold a root of a candidate, one lane an eighth.
+    uint32_t some = 0;
+    for (int64_t i = 0; i < count; ++i) {
+      V offset[3];
+      for (int axis = 0; axis < 3; ++axis) offset[axis] = V(scratch.at[axis][begin + i]) - parts.cell.c[kMonomials * axis];
+      const uint32_t may = bits(may_hold(parts.bounds.box, parts.bounds.inverse, parts.bounds.reach, offset)) & 255;
+      scratch.query[masks + i] = int32_t(may);
+      some |= may;
+    }
     for (int lane = 0; lane < width && eighth + lane < 8; ++lane) {
+      if (!(some >> lane & 1)) continue;
       Part<S> child;
       pick(parts, lane, child);
       child.level = part.level + 1;
       child.scale = part.scale * S(0.5);
       for (int i = 0; i < 3; ++i) child.shift[i] = part.shift[i] + part.scale * shift[i][lane];
-      const Test<S> test(child);
-      int64_t end = begin + count;
-      for (int64_t first = begin; first < begin + count; first += width) {
-        const int here = begin + count - first < width ? int(begin + count - first) : width;
-        const S *const x = scratch.at[0] + first, *const y = scratch.at[1] + first, *const z = scratch.at[2] + first;
-        const uint32_t inside = bits(test(load<S>(x), load<S>(y), load<S>(z))) & ((uint32_t(2) << (here - 1)) - 1);
-        end = append(scratch, end, inside, x, y, z, scratch.query + first);
+      int64_t kept = end;
+      for (int64_t i = 0; i < count; ++i) {
+        if (!(scratch.query[masks + i] >> lane & 1)) continue;
+        for (int axis = 0; axis < 3; ++axis) scratch.at[axis][kept] = scratch.at[axis][begin + i];
+        scratch.query[kept++] = scratch.query[begin + i];
       }
-      if (end > begin + count) search_part(search, child, begin + count, end - begin - count);
+      search_part(search, child, end, kept - end);
     }
   }
 }
@@ -328,8 +335,11 @@ void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>
           near += queries.begin[row + high[0] + 1] - queries.begin[row + low[0]];
         }
       if (!near) continue;
-      if (!loaded) load_cells(task.transforms, task.geometry, block.x + first, block.y, block.z, cells);
-      loaded = true;
+      if (!loaded) {
+        load_cells(task.transforms, task.geometry, block.x + first, block.y, block.z, cells.cell);
+        bound_cell<V, S>(cells.cell, cells.bounds);
+        loaded = true;
+      }
       scratch.reserve(&scratch, near);
       Part<S> part;
       pick(cells, lane, part);

@@ -150,6 +150,71 @@ template <class S> SNARF_HD Lanes<S> truncate(Lanes<S> a) {
 #endif
 }
 
+template <class S> SNARF_HD Lanes<S> load(const S* at) {
+  Lanes<S> out;
+  memcpy(&out.v, at, sizeof out.v);
+  return out;
+}
+template <class S> SNARF_HD void store(S* at, Lanes<S> value) { memcpy(at, &value.v, sizeof value.v); }
+
+// The numbers 0 to 11 of `width` rows as twelve packs, one lane a row.
+template <class S> SNARF_HD void load_rows(const S* const* row, Lanes<S>* out) {
+  constexpr int width = Lanes<S>::width;
+  for (int r = 0; r < 12; ++r) {
+    S column[width];
+    for (int i = 0; i < width; ++i) column[i] = row[i][r];
+    out[r] = load<S>(column);
+  }
+}
+
+// a moved down by one lane, and `last` in the highest.
+template <class S> SNARF_HD Lanes<S> shifted(Lanes<S> a, S last) {
+  constexpr int width = Lanes<S>::width;
+  S values[width + 1];
+  store(values, a);
+  values[width] = last;
+  return load<S>(values + 1);
+}
+
+#if defined(__AVX512F__) && defined(__GNUC__)
+// Four rows share a register, 128 bits each, in such an order that transposing within the 128 bits puts every row in its lane.
+SNARF_HD void load_rows(const float* const* row, Lanes<float>* out) {
+  for (int r = 0; r < 12; r += 4) {
+    __m512 part[4];
+    for (int i = 0; i < 4; ++i) {
+      part[i] = _mm512_castps128_ps512(_mm_loadu_ps(row[i] + r));
+      part[i] = _mm512_insertf32x4(part[i], _mm_loadu_ps(row[4 + i] + r), 1);
+      part[i] = _mm512_insertf32x4(part[i], _mm_loadu_ps(row[8 + i] + r), 2);
+      part[i] = _mm512_insertf32x4(part[i], _mm_loadu_ps(row[12 + i] + r), 3);
+    }
+    const __m512d a = _mm512_castps_pd(_mm512_unpacklo_ps(part[0], part[1])), b = _mm512_castps_pd(_mm512_unpackhi_ps(part[0], part[1]));
+    const __m512d c = _mm512_castps_pd(_mm512_unpacklo_ps(part[2], part[3])), d = _mm512_castps_pd(_mm512_unpackhi_ps(part[2], part[3]));
+    out[r].v = (Lanes<float>::Vector)_mm512_unpacklo_pd(a, c);
+    out[r + 1].v = (Lanes<float>::Vector)_mm512_unpackhi_pd(a, c);
+    out[r + 2].v = (Lanes<float>::Vector)_mm512_unpacklo_pd(b, d);
+    out[r + 3].v = (Lanes<float>::Vector)_mm512_unpackhi_pd(b, d);
+  }
+}
+SNARF_HD Lanes<float> shifted(Lanes<float> a, float last) {
+  const __m512i next = _mm512_castps_si512(_mm512_set1_ps(last));
+  return {(Lanes<float>::Vector)_mm512_alignr_epi32(next, (__m512i)a.v, 1)};
+}
+#elif defined(__AVX2__) && defined(__GNUC__)
+SNARF_HD void load_rows(const float* const* row, Lanes<float>* out) {
+  for (int r = 0; r < 12; r += 4) {
+    __m256 part[4];
+    for (int i = 0; i < 4; ++i)
+      part[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row[i] + r)), _mm_loadu_ps(row[4 + i] + r), 1);
+    const __m256d a = _mm256_castps_pd(_mm256_unpacklo_ps(part[0], part[1])), b = _mm256_castps_pd(_mm256_unpackhi_ps(part[0], part[1]));
+    const __m256d c = _mm256_castps_pd(_mm256_unpacklo_ps(part[2], part[3])), d = _mm256_castps_pd(_mm256_unpackhi_ps(part[2], part[3]));
+    out[r].v = (Lanes<float>::Vector)_mm256_unpacklo_pd(a, c);
+    out[r + 1].v = (Lanes<float>::Vector)_mm256_unpackhi_pd(a, c);
+    out[r + 2].v = (Lanes<float>::Vector)_mm256_unpacklo_pd(b, d);
+    out[r + 3].v = (Lanes<float>::Vector)_mm256_unpackhi_pd(b, d);
+  }
+}
+#endif
+
 // One bit per lane, lane 0 lowest.
 template <class S> SNARF_HD uint32_t bits(LaneMask<S> mask) {
 #if defined(__AVX512DQ__)
@@ -172,13 +237,6 @@ template <class S> SNARF_HD LaneMask<S> first_lanes(int count) {
   for (int i = 0; i < Lanes<S>::width; ++i) out.v[i] = i < count ? -1 : 0;
   return out;
 }
-
-template <class S> SNARF_HD Lanes<S> load(const S* at) {
-  Lanes<S> out;
-  memcpy(&out.v, at, sizeof out.v);
-  return out;
-}
-template <class S> SNARF_HD void store(S* at, Lanes<S> value) { memcpy(at, &value.v, sizeof value.v); }
 
 SNARF_HD int lowest_bit(uint32_t mask) {
 #if defined(__GNUC__)

@@ -47,7 +47,9 @@ SNARF_HD int square_monomial(int axis, int others) { return 8 + 4 * axis + other
 template <class V, class S> SNARF_HD void cell_from_corners(V* corner, const V* centre, const S* size, Cell<V>& cell) {
   // Trilinear coefficients of T in centred coordinates, in place: index k becomes the monomial with the bits of k.
   for (int channel = 0; channel < 12; ++channel)
+    SNARF_UNROLL
     for (int bit = 1; bit < 8; bit <<= 1)
+      SNARF_UNROLL
       for (int k = 0; k < 8; ++k)
         if (!(k & bit)) {
           V& low = corner[k * 12 + channel];
@@ -59,14 +61,18 @@ template <class V, class S> SNARF_HD void cell_from_corners(V* corner, const V* 
   for (int i = 0; i < 3; ++i) {
     V* c = cell.c + kMonomials * i;
     const V* row = corner + 4 * i;
+    SNARF_UNROLL
     for (int m = 0; m < 8; ++m) {
       const V* t = row + 12 * m;
       c[m] = t[0] * centre[0] + t[1] * centre[1] + t[2] * centre[2] + t[3];
+      SNARF_UNROLL
       for (int axis = 0; axis < 3; ++axis)
         if (m >> axis & 1) c[m] = c[m] + row[12 * (m & ~(1 << axis)) + axis] * size[axis];
     }
+    SNARF_UNROLL
     for (int axis = 0; axis < 3; ++axis) {
       int first = axis == 0 ? 2 : 1, second = axis == 2 ? 2 : 4;
+      SNARF_UNROLL
       for (int others = 0; others < 4; ++others) {
         int m = (1 << axis) | (others & 1 ? first : 0) | (others & 2 ? second : 0);
         c[square_monomial(axis, others)] = row[12 * m + axis] * size[axis];
@@ -75,19 +81,30 @@ template <class V, class S> SNARF_HD void cell_from_corners(V* corner, const V* 
   }
 }
 
-// Bounds of the cell, rigorous up to rounding, for which slack is added.
+// Half extents [3] of the posed box, rigorous up to rounding, for which slack is added.
+template <class V, class S> SNARF_HD void bound_box(const Cell<V>& cell, V* box) {
+  constexpr S epsilon = sizeof(S) == 4 ? S(1e-6) : S(1e-14);
+  const S wide = S(0.5) + face_tolerance<S>();
+  for (int i = 0; i < 3; ++i) {
+    const V* c = cell.c + kMonomials * i;
+    V sums[5];  // by degree
+    SNARF_UNROLL
+    for (int degree = 1; degree < 5; ++degree) sums[degree] = c[0] * S(0);
+    SNARF_UNROLL
+    for (int m = 1; m < kMonomials; ++m) sums[monomial_degree(m)] = sums[monomial_degree(m)] + absolute(c[m]);
+    V extent = (((sums[4] * wide + sums[3]) * wide + sums[2]) * wide + sums[1]) * wide;
+    box[i] = extent * (S(1) + S(16) * epsilon) + absolute(c[0]) * epsilon;
+  }
+}
+
+// All bounds of the cell, with the same slack.
 template <class V, class S> SNARF_HD void bound_cell(const Cell<V>& cell, CellBounds<V>& out) {
   constexpr S epsilon = sizeof(S) == 4 ? S(1e-6) : S(1e-14);
   const S wide = S(0.5) + face_tolerance<S>();
+  bound_box<V, S>(cell, out.box);
   V jacobian[9], adj[9];
   for (int i = 0; i < 3; ++i) {
     const V* c = cell.c + kMonomials * i;
-    V extent = c[1] * S(0);
-    for (int m = 1; m < kMonomials; ++m) {
-      int degree = monomial_degree(m);
-      extent = extent + absolute(c[m]) * (degree == 1 ? wide : degree == 2 ? wide * wide : degree == 3 ? wide * wide * wide : S(0.0626));
-    }
-    out.box[i] = extent * (S(1) + S(16) * epsilon) + absolute(c[0]) * epsilon;
     jacobian[3 * i] = c[1];
     jacobian[3 * i + 1] = c[2];
     jacobian[3 * i + 2] = c[4];
@@ -103,21 +120,24 @@ template <class V, class S> SNARF_HD void bound_cell(const Cell<V>& cell, CellBo
   out.curvature = zero;
   for (int i = 0; i < 3; ++i) {
     const V* row = out.inverse + 3 * i;
-    V reach = zero, slope = zero;
+    V sums[5];
+    SNARF_UNROLL
+    for (int degree = 2; degree < 5; ++degree) sums[degree] = zero;
+    SNARF_UNROLL
     for (int m = 0; m < kMonomials; ++m) {
-      int degree = monomial_degree(m);
-      if (degree < 2) continue;
+      if (monomial_degree(m) < 2) continue;
       const V* c = cell.c + m;
       V y = absolute(row[0] * c[0] + row[1] * c[kMonomials] + row[2] * c[2 * kMonomials]);
-      reach = reach + y * (degree == 2 ? S(0.25) : degree == 3 ? S(0.125) : S(0.0625));
-      slope = slope + y * (degree == 2 ? S(1) : degree == 3 ? S(0.75) : S(0.5));
+      sums[monomial_degree(m)] = sums[monomial_degree(m)] + y;
     }
+    V reach = sums[2] * S(0.25) + sums[3] * S(0.125) + sums[4] * S(0.0625);
+    V slope = sums[2] + sums[3] * S(0.75) + sums[4] * S(0.5);
     V rounding = absolute(row[0] * cell.c[0]) + absolute(row[1] * cell.c[kMonomials]) + absolute(row[2] * cell.c[2 * kMonomials]);
-    out.reach[i] = wide + reach * S(1.001) + (rounding + S(1)) * epsilon;
+    reach = wide + reach * S(1.001) + (rounding + S(1)) * epsilon;
+    out.reach[i] = select(regular, reach, zero + S(1e30));
     out.curvature = larger(out.curvature, slope);
   }
   out.curvature = select(regular, out.curvature, zero + S(1e30));
-  for (int i = 0; i < 3; ++i) out.reach[i] = select(regular, out.reach[i], zero + S(1e30));
 }
 
 // Whether a query at `offset` [3] from the posed centre may have a root in the cell.
@@ -135,11 +155,13 @@ template <class V, class S> SNARF_HD void halve_cell(const Cell<V>& cell, const 
   for (int i = 0; i < 3; ++i) {
     V* c = part.c + kMonomials * i;
     for (int m = 0; m < kMonomials; ++m) c[m] = cell.c[kMonomials * i + m];
+    SNARF_UNROLL
     for (int axis = 0; axis < 3; ++axis) {
       V h = shift[axis];
       int first = axis == 0 ? 1 : 0, second = axis == 2 ? 1 : 2;
       int bit = 1 << axis, first_bit = 1 << first, second_bit = 1 << second;
       // a + b s + c s^2 with s = h + s' / 2, for the four monomials of the other two axes ...
+      SNARF_UNROLL
       for (int others = 0; others < 4; ++others) {
         int base = (others & 1 ? first_bit : 0) | (others & 2 ? second_bit : 0);
         V& a = c[base];
@@ -150,10 +172,12 @@ template <class V, class S> SNARF_HD void halve_cell(const Cell<V>& cell, const 
         q = q * S(0.25);
       }
       // ... and a + b s for the squares of the others.
+      SNARF_UNROLL
       for (int other = 0; other < 2; ++other) {
         int squared = other ? second : first, companion = other ? first : second;
         // Among the companions of squared^2, this axis and `companion` in ascending order.
         int mine = axis < companion ? 1 : 2, theirs = 3 - mine;
+        SNARF_UNROLL
         for (int with = 0; with < 2; ++with) {
           V& a = c[square_monomial(squared, with ? theirs : 0)];
           V& b = c[square_monomial(squared, with ? 3 : mine)];

@@ -20,6 +20,15 @@
 #define SNARF_HD __forceinline
 #endif
 
+// Before a loop of few rounds whose indices should be known to the compiler.
+#if defined(__CUDACC__) || defined(__clang__)
+#define SNARF_UNROLL _Pragma("unroll")
+#elif defined(__GNUC__)
+#define SNARF_UNROLL _Pragma("GCC unroll 32")
+#else
+#define SNARF_UNROLL
+#endif
+
 namespace snarf {
 namespace SNARF_ISA {
 

@@ -6,15 +6,18 @@ version in PyTorch) and one for CUDA tensors, a fake kernel that only knows shap
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from functools import cache
 
 import torch
 from torch import Tensor
 
-from snarfcli.deformer import native
+from snarfcli.deformer import cuda, native
 from snarfcli.deformer.blending import refuse_second_derivative
 from snarfcli.deformer.broyden import broyden_roots
 from snarfcli.deformer.complete import complete_roots
+from snarfcli.deformer.cuda_compile import nvrtc_version
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
 from snarfcli.deformer.library import choose_backend
 from snarfcli.deformer.search import Roots
@@ -53,18 +56,21 @@ def complete_search(
     Returns:
         canonical [M, 3], query [M], jacobian_inverse [M, 3, 3], and the number of roots found, [1].
     """
-    grid = CanonicalGrid(lower, upper)
-    nodes = (shape[0], shape[1], shape[2])
-    tolerance = tolerance * grid.longest_side
-    if choose_backend(backend) == "native":
+    grid, nodes = _grid(lower, upper, shape)
+    if points.is_cuda and _choose_cuda(backend) == "native":
+        box = (lower, upper, shape)
+        return cuda.complete_search(
+            points, transforms, *box, active_cells, tolerance, max_steps, orientation_preserving, capacity
+        )
+    metres = tolerance * grid.longest_side
+    if not points.is_cuda and choose_backend(backend) == "native":
+        size = grid.cell_size(nodes)
         found = native.complete_search(
-            points, transforms, lower, grid.cell_size(nodes), nodes, active_cells, tolerance, max_steps, orientation_preserving
+            points, transforms, lower, size, nodes, active_cells, metres, max_steps, orientation_preserving
         )
     else:
-        roots = complete_roots(
-            points, transforms, grid, nodes, active_cells=active_cells, tolerance=tolerance, max_steps=max_steps
-        )
-        found = _reference_result(roots, orientation_preserving)
+        settings = {"active_cells": active_cells, "tolerance": metres, "max_steps": max_steps}
+        found = _reference_result(complete_roots(points, transforms, grid, nodes, **settings), orientation_preserving)
     return _padded(*found, points, capacity)
 
 
@@ -91,24 +97,14 @@ def broyden_search(
         divergence: residual at which a start is given up, as a share of the box's longest side.
         exact_jacobian: whether the inverse Jacobian is the exact one at the root or the iteration's approximation.
     """
-    grid = CanonicalGrid(lower, upper)
-    nodes = (shape[0], shape[1], shape[2])
-    tolerance, divergence = tolerance * grid.longest_side, divergence * grid.longest_side
-    if choose_backend(backend) == "native":
-        size = grid.cell_size(nodes)
-        found = native.broyden_search(
-            points,
-            transforms,
-            starts,
-            lower,
-            size,
-            nodes,
-            tolerance,
-            divergence,
-            max_steps,
-            exact_jacobian,
-            orientation_preserving,
-        )
+    grid, nodes = _grid(lower, upper, shape)
+    settings = (max_steps, exact_jacobian, orientation_preserving)
+    if points.is_cuda and _choose_cuda(backend) == "native":
+        box = (lower, upper, shape)
+        return cuda.broyden_search(points, transforms, starts, *box, tolerance, divergence, *settings, capacity)
+    metres = (tolerance * grid.longest_side, divergence * grid.longest_side)
+    if not points.is_cuda and choose_backend(backend) == "native":
+        found = native.broyden_search(points, transforms, starts, lower, grid.cell_size(nodes), nodes, *metres, *settings)
     else:
         roots = broyden_roots(
             points,
@@ -117,8 +113,8 @@ def broyden_search(
             grid,
             nodes,
             exact_jacobian=exact_jacobian,
-            tolerance=tolerance,
-            divergence=divergence,
+            tolerance=metres[0],
+            divergence=metres[1],
             max_steps=max_steps,
         )
         found = _reference_result(roots, orientation_preserving)
@@ -148,13 +144,14 @@ def implicit_backward(
 
     Source: SNARF Eq. 14.
     """
-    nodes = (shape[0], shape[1], shape[2])
+    grid, nodes = _grid(lower, upper, shape)
     wants = (wants_points, wants_transforms)
-    grid = CanonicalGrid(lower, upper)
-    if choose_backend(backend) == "native":
-        size = grid.cell_size(nodes)
-        return native.implicit_backward(gradient, canonical, query, jacobian_inverse, lower, size, nodes, batch, count, wants)
-    return implicit_backward_reference(gradient, canonical, query, jacobian_inverse, grid, nodes, batch, count, wants)
+    roots = (gradient, canonical, query, jacobian_inverse)
+    if gradient.is_cuda and _choose_cuda(backend) == "native":
+        return cuda.implicit_backward(*roots, lower, upper, shape, batch, count, *wants)
+    if not gradient.is_cuda and choose_backend(backend) == "native":
+        return native.implicit_backward(*roots, lower, grid.cell_size(nodes), nodes, batch, count, wants)
+    return implicit_backward_reference(*roots, grid, nodes, batch, count, wants)
 
 
 def implicit_backward_reference(
@@ -191,6 +188,37 @@ def implicit_backward_reference(
     return v_points, v_transforms
 
 
+def _grid(lower: Tensor, upper: Tensor, shape: Sequence[int]) -> tuple[CanonicalGrid, tuple[int, int, int]]:
+    return CanonicalGrid(lower, upper, checked=True), (shape[0], shape[1], shape[2])
+
+
+def _choose_cuda(backend: str) -> str:
+    """Return "native" or "reference" for tensors on a GPU, as `choose_backend` does for those on a CPU."""
+    if backend == "reference":
+        return backend
+    reason = _why_no_kernels()
+    if reason is None:
+        return "native"
+    if backend == "native":
+        raise RuntimeError(f"backend native is not available on this GPU: {reason}")
+    return "reference"
+
+
+@cache
+def _why_no_kernels() -> str | None:
+    """Return why the CUDA kernels cannot be compiled, after a warning, or None."""
+    try:
+        nvrtc_version()
+    except (RuntimeError, OSError) as error:
+        warnings.warn(
+            f"snarf searches with its reference in PyTorch, many times slower than its CUDA kernels: {error}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return str(error)
+    return None
+
+
 def _reference_result(roots: Roots, orientation_preserving: bool) -> tuple[Tensor, Tensor, Tensor]:
     if orientation_preserving:
         roots = roots.take((torch.linalg.det(roots.jacobian_inverse) > 0).nonzero()[:, 0])
@@ -213,12 +241,6 @@ def _padded(
     for filled, values in zip(out, (canonical, query, jacobian_inverse), strict=True):
         filled[:kept] = values[:kept]
     return *out, found
-
-
-# ---------------------------------------------------------------- CUDA
-@complete_search.register_kernel("cuda")
-def _(points, transforms, lower, upper, shape, active_cells, tolerance, max_steps, orientation_preserving, capacity, backend):
-    raise NotImplementedError("the CUDA search is not here yet")
 
 
 # ---------------------------------------------------------------- shapes

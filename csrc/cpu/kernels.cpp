@@ -11,12 +11,13 @@
 #include "snarf/cell.h"
 #include "snarf/implicit.h"
 #include "snarf/newton.h"
+#include "snarf/search.h"
 
 namespace snarf {
 namespace SNARF_ISA {
 namespace {
 
-// The polynomials of kWidth cells, one a lane, laid out so that one cell's numbers can be picked out.
+// The polynomials of as many cells as there are lanes, laid out so that one cell's numbers can be picked out.
 template <class S> struct CellLanes {
   static constexpr int width = Lanes<S>::width;
   Cell<Lanes<S>> cell;
@@ -212,10 +213,7 @@ void emit(Search<S>& search, const Part<S>& part, const int32_t* queries, uint32
   }
 }
 
-// Where Newton's method starts: a corner (0 to 7), the centre, or the root of the linearised cell.
-enum Start { kCentre = 8, kGuess = 9, kStarts = 10 };
-
-// Newton's method for `count` candidates of a part, which stand at `begin` in the scratch lists.
+// Newton's method for `count` candidates of a part, which stand at `begin` in the scratch lists. `start` is one of kStarts.
 template <class S> void solve(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count, int start) {
   using V = Lanes<S>;
   constexpr int width = V::width;
@@ -226,11 +224,11 @@ template <class S> void solve(Search<S>& search, const Part<S>& part, int64_t be
     V offset[3], s[3], inverse[9];
     for (int i = 0; i < 3; ++i) offset[i] = load<S>(search.scratch.at[i] + first) - part.c[kMonomials * i];
     for (int i = 0; i < 3; ++i) {
-      if (start == kGuess) {
+      if (start == kAffineStart) {
         const V guess = offset[0] * part.inverse[3 * i] + offset[1] * part.inverse[3 * i + 1] + offset[2] * part.inverse[3 * i + 2];
         s[i] = smaller(larger(guess, V(S(-0.5))), V(S(0.5)));
       } else {
-        s[i] = V(start == kCentre ? S(0) : start >> i & 1 ? S(0.5) : S(-0.5));
+        s[i] = V(start == kCentreStart ? S(0) : start >> i & 1 ? S(0.5) : S(-0.5));
       }
     }
     for (int i = 0; i < 9; ++i) inverse[i] = V(S(0));
@@ -256,7 +254,7 @@ SNARF_HD int64_t append(Scratch<S>& scratch, int64_t end, uint32_t inside, const
 template <class S> void search_part(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count) {
   using V = Lanes<S>;
   constexpr int width = V::width;
-  if (part.curvature < S(kTame)) return solve(search, part, begin, count, kGuess);
+  if (part.curvature < S(kTame)) return solve(search, part, begin, count, kAffineStart);
   if (part.level == kLevels) {
     for (int start = 0; start < kStarts; ++start) solve(search, part, begin, count, start);
     return;

@@ -103,11 +103,6 @@ template <class S> struct Kernels {
   void (*backward)(const BackwardTask<S>&);
 };
 
-// Cells with a curvature (cell.h) up to this are solved from one start; others are cut into eight.
-constexpr double kTame = 0.9;
-// How often; a part that still is not tame then gets several starts.
-constexpr int kLevels = 4;
-
 namespace avx512 { template <class S> Kernels<S> kernels(); }
 namespace avx2 { template <class S> Kernels<S> kernels(); }
 namespace baseline { template <class S> Kernels<S> kernels(); }

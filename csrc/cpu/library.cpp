@@ -18,6 +18,7 @@
 
 #include "kernels.h"
 #include "snarf/api.h"
+#include "snarf/search.h"
 #include "team.h"
 
 namespace snarf {
@@ -26,8 +27,6 @@ namespace {
 constexpr int64_t kGroupQueries = int64_t(1) << 20;  // queries searched together: bounds the memory of the sort
 constexpr int64_t kGroupBlocks = int64_t(1) << 17;   // blocks of cells of all poses searched together: 50 MB of boxes
 constexpr double kBinPerBox = 0.6;                  // side of a bin, in mean sides of the posed boxes
-constexpr double kSameRoot = 5e-3;                   // of a cell: two reports of one root; Newton's errors are far smaller
-constexpr double kSameBroydenRoot = 5e-2;            // of a cell: Broyden's roots are only as exact as the tolerance
 constexpr int64_t kQueriesPerThread = 2048;          // less is not worth starting a thread for
 
 enum InstructionSet { kBaseline, kAvx2, kAvx512 };
@@ -256,7 +255,11 @@ template <class S> class Collect {
       for (int64_t q = first, at = start; q < last; ++q) {
         const int64_t end = begin_[q].load(std::memory_order_relaxed);
         const Root<S>** const roots = group_.sorted.get();
-        if (end - at > 1) std::sort(roots + at, roots + end, comes_before<S>);
+        if (end - at == 1) {
+          roots[kept++] = roots[at++];
+          continue;
+        }
+        std::sort(roots + at, roots + end, comes_before<S>);
         const int64_t mine = kept;
         for (; at < end; ++at) {
           bool is_new = true;

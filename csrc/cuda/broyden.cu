@@ -1,9 +1,9 @@
 // The papers' search: Broyden's method from one start per bone (broyden.h).
 //
 // DESIGN. One thread takes one query through all its starts, one after the other, and drops what it has found already. A thread
-// for each pair of query and start would need memory for queries times starts, since which of several equal roots is kept must not
-// depend on which thread comes first. The threads of a warp stand side by side in the array of queries and take the same start at
-// the same time; their look-ups into the grid are as coherent as the queries are. blockIdx.y is the pose.
+// for each pair of query and start would need memory for queries times starts, since which of several equal roots is kept must
+// not depend on which thread comes first. The threads of a warp stand side by side in the array of queries and take the same
+// start at the same time; their look-ups into the grid are as coherent as the queries are. blockIdx.y is the pose.
 #include "search.cuh"
 #include "snarf/broyden.h"
 

@@ -1,20 +1,20 @@
 // The complete search: every root of d(x) = x' in every active cell.
 //
-// DESIGN. Cell by cell, as on the CPU (csrc/cpu/kernels.cpp). Each kernel runs once for a group of poses; blockIdx.y is the pose.
-//   survey          One thread turns one cell into its polynomial and bounds (cell.h) and writes them down as a Record (304 bytes
-//                   in float32); tame and curved cells are listed apart. Further blocks read the queries. Both leave the bounds
-//                   of what they saw, by atomics on integers ordered like the floats.
-//   count_queries,  One thread a query: counting sort into uniform bins over the region that both bounds share, at most `bins` of
-//   place_queries   them, x fastest, so that a run of bins along x is one contiguous range. Between the two stands a running sum.
-//   search_tame     One block takes as many cells as it has threads. The rows of bins that their posed boxes touch are dealt out to
-//                   the threads evenly, and so are the queries in those rows, whichever cells they belong to: cells differ a
-//                   thousandfold in load. Candidates that pass the cell's test queue in shared memory until there is one for each
-//                   thread; then Newton's method runs on full warps. Coefficients come from the records, through the L1 cache.
-//   search_curved   The same for the eight parts of each curved cell, halved into shared memory. A part that is still curved is
-//                   halved further by the thread that holds the candidate, with a stack in local memory.
-// Which bin, block or thread meets a pair of query and cell does not change what it computes, so the set of roots depends on nothing
-// but the query and the pose; gather.cu puts it in order. No kernel needs a certain block size, up to the limits below, and none
-// waits for the host.
+// DESIGN. Cell by cell, as on the CPU (csrc/cpu/kernels.cpp). Each kernel runs once for a group of poses; blockIdx.y: the pose.
+//   survey         One thread turns one cell into its polynomial and bounds (cell.h) and writes them down, a Record (304 bytes
+//                  in float32); tame and curved cells are listed apart. Further blocks read the queries. Both leave the bounds
+//                  of what they saw, by atomics on integers ordered like the floats.
+//   count_queries  One thread a query: counting sort into uniform bins over the region that both bounds share, x fastest, so
+//   place_queries  that a run of bins along x is one contiguous range. Between the two stands a running sum.
+//   search_tame    One block takes as many cells as it has threads. The rows of bins that their posed boxes touch are dealt out
+//                  to the threads evenly, and so are the queries in those rows, whichever cells they belong to: cells differ a
+//                  thousandfold in load. Candidates that pass the cell's test queue in shared memory until there is one for
+//                  each thread; then Newton's method runs on full warps, with coefficients from the records.
+//   search_curved  The same for the eight parts of each curved cell, halved into shared memory. A part that is still curved is
+//                  halved further by the thread that holds the candidate, with a stack in local memory.
+// Which bin, block or thread meets a pair of query and cell does not change what it computes, so the set of roots depends on
+// nothing but the query and the pose; gather.cu puts it in order. No kernel needs a certain block size, up to the limits below,
+// and none waits for the host.
 // Limits: B N, the cells of the grid and the roots below 2^31. Points and boxes beyond 1e30 metres have no roots.
 #include "search.cuh"
 #include "snarf/cell.h"
@@ -223,11 +223,11 @@ template <class S> struct Pair {
   S cell_centre[3];  // canonical, metres
 };
 
-// Newton's method from one start in a part with side `scale` around `shift` (cell coordinates). Writes the canonical root and the
-// inverse of dd/dx there; returns whether there is one. The same arithmetic as on the CPU.
+// Newton's method from one start in a part with side `scale` around `shift` (cell coordinates). Writes the canonical root and
+// the inverse of dd/dx there; returns whether there is one. The same arithmetic as on the CPU.
 template <class S>
-__device__ __forceinline__ bool solve(const Search<S>& a, const Grid<S>& grid, const Pair<S>& pair, const Record<S>& part, const S* shift,
-                                      S scale, int start, S* canonical, S* inverse) {
+__device__ __forceinline__ bool solve(const Search<S>& a, const Grid<S>& grid, const Pair<S>& pair, const Record<S>& part,
+                                      const S* shift, S scale, int start, S* canonical, S* inverse) {
   const Solver<S> solver = {S(a.tolerance) * longest_side(a), a.max_steps};
   S c[3 * kMonomials], offset[3], s[3];
   for (int m = 0; m < 3 * kMonomials; ++m) c[m] = part.cell.c[m];
@@ -253,7 +253,8 @@ template <class S> __device__ bool holds(const Record<S>& part, const S* target)
   return may_hold(part.bounds.box, part.bounds.inverse, part.bounds.reach, offset);
 }
 
-template <class S> __device__ void solve_tame(const Search<S>& a, const Grid<S>& grid, const Pair<S>& pair, const Record<S>& record) {
+template <class S>
+__device__ void solve_tame(const Search<S>& a, const Grid<S>& grid, const Pair<S>& pair, const Record<S>& record) {
   const Record<S> cell = record;  // as a whole, in wide loads
   const S shift[3] = {0, 0, 0};
   S canonical[3], inverse[9];
@@ -272,9 +273,9 @@ template <class S> __device__ void halve(const Cell<S>& whole, int k, Record<S>&
   bound_cell<S, S>(part.cell, part.bounds);
 }
 
-// The roots in eighth k of a cell, of which `first` is the record: depth first through its parts, down to tame ones or to the last
-// level, where several starts are tried. What several starts or neighbouring parts report is only counted once here already, so that
-// few slots are needed.
+// The roots in eighth k of a cell, of which `first` is the record: depth first through its parts, down to tame ones or to the
+// last level, where several starts are tried. What several starts or neighbouring parts report is only counted once here
+// already, so that few slots are needed.
 template <class S>
 __device__ void solve_curved(const Search<S>& a, const Grid<S>& grid, const Pair<S>& pair, const Record<S>& first, int k) {
   constexpr int kSeen = 8;
@@ -349,11 +350,11 @@ __device__ __forceinline__ int owner_of(const long long* sums, long long& n) {
   return first;
 }
 
-// Searches the items of one chunk: as many as the block has threads. kCurved: an item is an eighth of a curved cell, otherwise a tame
-// cell. kMost: most threads of a block.
+// Searches the items of one chunk: as many as the block has threads. kCurved: an item is an eighth of a curved cell, otherwise
+// a tame cell. kMost: most threads of a block.
 template <class S, bool kCurved, int kMost>
-__device__ __forceinline__ void search_chunk(const Search<S>& a, const Grid<S>& grid, const Bins<S>& bins, long long chunk, long long chunks,
-                                             long long items) {
+__device__ __forceinline__ void search_chunk(const Search<S>& a, const Grid<S>& grid, const Bins<S>& bins, long long chunk,
+                                             long long chunks, long long items) {
   __shared__ Record<S> parts[kCurved ? kMost : 1];
   __shared__ int item_cell[kMost];                                                        // number in the group
   __shared__ int low_x[kMost], high_x[kMost], low_y[kMost], low_z[kMost], size_y[kMost];  // bins that the item's box touches

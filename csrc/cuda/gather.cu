@@ -4,8 +4,8 @@
 //   collect_roots  sorts the list by insertion, takes out what neighbouring cells or several starts reported twice, and counts.
 //                  Between the two kernels stands a running sum over the queries.
 //   write_roots    copies the list to where the query's roots stand in the result.
-// What comes out depends on the set of roots alone, not on the order in which they were found. All links are read and written by
-// the query's own thread. Without room for all roots, those beyond `slots` or `capacity` are missing and `found` tells.
+// What comes out depends on the set of roots alone, not on the order in which they were found. All links are read and written
+// by the query's own thread. Without room for all roots, those beyond `slots` or `capacity` are missing and `found` tells.
 #include "search.cuh"
 
 namespace snarf {

@@ -96,8 +96,8 @@ template <class S> SNARF_HD bool preserves_orientation(const S* inverse) {
   return adjugate(inverse, minors) > 0;
 }
 
-// Puts a root on its query's list. Which slot it gets is a matter of time; collect_roots() sorts that out. Roots for which there is
-// no slot are only counted.
+// Puts a root on its query's list. Which slot it gets is a matter of time; collect_roots() sorts that out. Roots for which
+// there is no slot are only counted.
 template <class S>
 __device__ __forceinline__ void report_root(const Search<S>& a, int query, int order, const S* canonical, const S* inverse) {
   int slot = atomicAdd(a.staged, 1);

@@ -16,7 +16,15 @@ from torch import Tensor
 from snarfcli.deformer.cuda_compile import cache_folder, nvrtc_version
 from snarfcli.deformer.cuda_driver import Launcher, gpu
 
-__all__ = ["broyden_search", "complete_search", "cuda_status", "implicit_backward", "run_backward", "run_broyden", "run_complete"]
+__all__ = [
+    "broyden_search",
+    "complete_search",
+    "cuda_status",
+    "implicit_backward",
+    "run_backward",
+    "run_broyden",
+    "run_complete",
+]
 
 _RECORD_NUMBERS = 76  # of one cell: polynomial and bounds (csrc/cuda/complete.cu)
 _GROUP_BYTES = 1 << 28  # most memory for the records of cells that are searched together
@@ -257,8 +265,7 @@ def _gather(
     threads = launcher.threads(_THREADS)
     whole = {"dtype": torch.int32, "device": points.device}
     blocks = (_blocks(queries, threads), 1)
-    # Some roots are reported twice. Without a capacity a guess serves; should it be too low, the search is done again.
-    slots = queries + min(queries, 1 << 20) + 1024 if capacity is None else capacity + capacity // 4 + 1024
+    slots = _first_guess(queries) if capacity is None else _slots_for(capacity)
     while True:
         slots = min(slots, _LIMIT - 1)
         state = torch.zeros(2 * queries + 1, **whole)
@@ -283,6 +290,16 @@ def _gather(
     arguments.capacity = len(out[0])
     launcher.launch("gather", "write_roots", blocks, threads, arguments)
     return out
+
+
+def _first_guess(queries: int) -> int:
+    """Return how many roots there may be; should there be more, the search is done again."""
+    return queries + min(queries, 1 << 20) + 1024
+
+
+def _slots_for(capacity: int) -> int:
+    """Return room for as many roots as wanted, of which neighbouring cells report some twice."""
+    return capacity + capacity // 4 + 1024
 
 
 def run_backward(

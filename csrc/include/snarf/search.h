@@ -13,8 +13,8 @@ constexpr int kLevels = 4;
 constexpr int kStarts = 10;
 constexpr int kCentreStart = 8, kAffineStart = 9;
 
-// Shares of a cell's shortest side within which two reports are of one root: Newton's errors are far smaller, Broyden's roots are
-// only as exact as the tolerance.
+// Shares of a cell's shortest side within which two reports are of one root: Newton's errors are far smaller, Broyden's roots
+// are only as exact as the tolerance.
 constexpr double kSameRoot = 5e-3;
 constexpr double kSameBroydenRoot = 5e-2;
 

@@ -84,7 +84,8 @@ template <class S> S atomicAdd(S* at, S value) {
 }
 
 // Runs a kernel on every block of the grid. Shared memory is static, so blocks do not run side by side.
-template <class Arguments> void run_grid(void (*kernel)(Arguments), const Arguments& arguments, unsigned x, unsigned y, unsigned threads) {
+template <class Arguments>
+void run_grid(void (*kernel)(Arguments), const Arguments& arguments, unsigned x, unsigned y, unsigned threads) {
   gridDim = {x, y, 1};
   blockDim = {threads, 1, 1};
   Barrier barrier(threads);

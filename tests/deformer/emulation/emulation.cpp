@@ -8,7 +8,7 @@
 
 namespace {
 
-using snarf::device::Number;
+using namespace snarf::device;
 
 template <class Arguments> struct Entry {
   const char* name;
@@ -16,7 +16,8 @@ template <class Arguments> struct Entry {
 };
 
 template <class Arguments, size_t count>
-bool run_named(const Entry<Arguments> (&entries)[count], const char* name, const void* arguments, unsigned x, unsigned y, unsigned threads) {
+bool run_named(const Entry<Arguments> (&entries)[count], const char* name, const void* arguments, unsigned x, unsigned y,
+               unsigned threads) {
   for (const auto& entry : entries)
     if (!strcmp(entry.name, name)) {
       run_grid(entry.kernel, *static_cast<const Arguments*>(arguments), x, y, threads);
@@ -25,23 +26,24 @@ bool run_named(const Entry<Arguments> (&entries)[count], const char* name, const
   return false;
 }
 
-const Entry<const snarf::device::Search<Number>> search_kernels[] = {
-    {"survey", snarf::device::survey},
-    {"count_queries", snarf::device::count_queries},
-    {"place_queries", snarf::device::place_queries},
-    {"search_tame", snarf::device::search_tame},
-    {"search_curved", snarf::device::search_curved},
-    {"search_from_starts", snarf::device::search_from_starts},
-    {"collect_roots", snarf::device::collect_roots},
-    {"write_roots", snarf::device::write_roots},
+const Entry<const Search<Number>> search_kernels[] = {
+    {"survey", survey},
+    {"count_queries", count_queries},
+    {"place_queries", place_queries},
+    {"search_tame", search_tame},
+    {"search_curved", search_curved},
+    {"search_from_starts", search_from_starts},
+    {"collect_roots", collect_roots},
+    {"write_roots", write_roots},
 };
-const Entry<const snarf::device::Backward<Number>> backward_kernels[] = {{"implicit_backward", snarf::device::implicit_backward}};
+const Entry<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
 
 }  // namespace
 
 // Returns whether there is a kernel of that name.
 extern "C" bool emulate(const char* name, const void* arguments, unsigned x, unsigned y, unsigned threads) {
-  return run_named(search_kernels, name, arguments, x, y, threads) || run_named(backward_kernels, name, arguments, x, y, threads);
+  return run_named(search_kernels, name, arguments, x, y, threads) ||
+         run_named(backward_kernels, name, arguments, x, y, threads);
 }
-extern "C" size_t search_bytes() { return sizeof(snarf::device::Search<Number>); }
-extern "C" size_t backward_bytes() { return sizeof(snarf::device::Backward<Number>); }
+extern "C" size_t search_bytes() { return sizeof(Search<Number>); }
+extern "C" size_t backward_bytes() { return sizeof(Backward<Number>); }

@@ -1,7 +1,7 @@
 """The correspondence searches side by side: how complete they are, and how fast.
 
     python benchmarks/bm_search.py                        everything
-    python benchmarks/bm_search.py --quick                about a minute
+    python benchmarks/bm_search.py --quick                a minute or two
     python benchmarks/bm_search.py --only time,memory     some parts: completeness, time, scaling, memory, training
     python benchmarks/bm_search.py --out search.md        the tables also as a Markdown file
 
@@ -26,6 +26,7 @@ from search_costs import MEMORY_HEADER, TRAINING_HEADER, memory_rows, training_r
 from searches import Method, as_found, methods
 from torch import Tensor
 
+from snarfcli.deformer import blend_transforms
 from snarfcli.deformer.library import instruction_set, why_unavailable
 from snarfcli.runs import machine_facts
 from snarfcli.sampling import winding_numbers
@@ -170,11 +171,11 @@ def interleaved(works: dict[str, Callable[[], object]], repeats: int) -> dict[st
 def times(report: Report, chosen: list[Method], quick: bool, queries: int, repeats: int) -> None:
     """Time all searches on mild and extreme poses, with one thread and with two."""
     threads, rows = torch.get_num_threads(), []
-    for count in (1, 2):
+    for count in (2,) if quick else (1, 2):
         torch.set_num_threads(count)
         for pose in ("arms_behind_back",) if quick else ("punching", "splits", "random joints"):
             scene = body_scene(pose)
-            for kind in QUERY_KINDS:
+            for kind in QUERY_KINDS[1:] if quick else QUERY_KINDS:
                 points = scene.queries(kind, queries)[None]
                 works = {}
                 for cells, active in (("near", scene.near_cells), ("all", None)):
@@ -182,6 +183,7 @@ def times(report: Report, chosen: list[Method], quick: bool, queries: int, repea
                         if method.uses_cells or cells == "all":
                             key = f"{method.name}|{cells if method.uses_cells else '-'}"
                             works[key] = _work(method, points, scene, active)
+                works["(blending of the node transforms alone)|-"] = _blending(scene)
                 seconds = interleaved(works, repeats)
                 base = next(iter(seconds.values()))
                 for key, values in seconds.items():
@@ -196,16 +198,20 @@ def times(report: Report, chosen: list[Method], quick: bool, queries: int, repea
     report.table(["pose", "queries", "threads", "search", "cells", "ms", "ratio"], rows)
 
 
+def _blending(scene: Scene) -> Callable[[], object]:
+    return lambda: blend_transforms(scene.weights, scene.transforms[None])
+
+
 def _work(method: Method, points: Tensor, scene: Scene, active: Tensor | None) -> Callable[[], object]:
     return lambda: method.run(points, scene.transforms[None], scene, active)
 
 
 def scaling(report: Report, chosen: list[Method], quick: bool, repeats: int) -> None:
-    """Time our searches for growing numbers of queries."""
+    """Time our complete search, the first of `chosen`, for growing numbers of queries."""
     scene = body_scene("arms_behind_back")
     counts = [25_000, 100_000, 400_000] if quick else [25_000 * 2**k for k in range(7)]
     rows = []
-    for method in (m for m in chosen if m.uses_cells):
+    for method in [m for m in chosen if m.uses_cells][:1]:
         for kind in QUERY_KINDS:
             points = scene.queries(kind, counts[-1])[None]
             for cells, active in (("near", scene.near_cells), ("all", None)):
@@ -254,7 +260,7 @@ def main() -> None:
     if "memory" in parts and Path("/proc/self/clear_refs").exists():
         report.say("## Peak extra memory")
         report.say("Growth of a process's peak (VmHWM) during one search, results included; each in a process of its own.")
-        report.table(MEMORY_HEADER, memory_rows(timed[:1] if quick else timed, 1_000_000 if quick else 10_000_000))
+        report.table(MEMORY_HEADER, memory_rows(timed[:1], (1_000_000,)) if quick else memory_rows(timed, (1_000_000, 10_000_000)))
     if "training" in parts:
         report.say("## Training step of 8 poses x 2,250 points")
         report.say(

@@ -28,8 +28,8 @@ TRAINING_HEADER = ["grid", "search", "forward, ms", "backward, ms", "both, ms", 
 _POSES = ("running_on_spot", "knees", "punching", "hips", "chicken_wings", "jumping_jacks", "shake_arms", "shake_hips")
 
 
-def memory_rows(chosen: list[Method], most: int) -> list[list[str]]:
-    """Return how far one search of `most` and of a tenth of it raises the peak of a process's memory (VmHWM).
+def memory_rows(chosen: list[Method], counts: tuple[int, ...]) -> list[list[str]]:
+    """Return how far searches of so many queries raise the peak of a process's memory (VmHWM).
 
     Each runs in a process of its own, in which the C library gives large blocks back as soon as they are freed, so that no
     memory from before is used again unseen.
@@ -38,7 +38,7 @@ def memory_rows(chosen: list[Method], most: int) -> list[list[str]]:
     for method in (m for m in chosen if m.uses_cells or "9 start bones, native" in m.name):
         for kind in QUERY_KINDS:
             for cells in ("near", "all") if method.uses_cells else ("all",):
-                for count in (most // 10, most):
+                for count in counts:
                     request = json.dumps([method.name, kind, cells, count])
                     done = subprocess.run(
                         [sys.executable, __file__, request], capture_output=True, text=True, check=False, env=environment

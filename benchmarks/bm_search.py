@@ -260,7 +260,8 @@ def main() -> None:
     if "memory" in parts and Path("/proc/self/clear_refs").exists():
         report.say("## Peak extra memory")
         report.say("Growth of a process's peak (VmHWM) during one search, results included; each in a process of its own.")
-        report.table(MEMORY_HEADER, memory_rows(timed[:1], (1_000_000,)) if quick else memory_rows(timed, (1_000_000, 10_000_000)))
+        which, counts = (timed[:1], (1_000_000,)) if quick else (timed, (1_000_000, 10_000_000))
+        report.table(MEMORY_HEADER, memory_rows(which, counts))
     if "training" in parts:
         report.say("## Training step of 8 poses x 2,250 points")
         report.say(

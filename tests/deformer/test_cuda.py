@@ -312,8 +312,8 @@ def test_roots_on_faces_come_once(runner):
 @pytest.mark.parametrize("block", [3, 8])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 def test_result_does_not_depend_on_the_size_of_a_block(emulated, block, dtype, monkeypatch):
-    # Real threads: a missing barrier, a race on shared memory or a wrong share of the work would show. Each barrier left out of
-    # search_items() was found in this test by ThreadSanitizer (build_emulation() tells how).
+    # Real threads: a missing barrier, a race on shared memory or a wrong share of the work would show. Leaving out
+    # any one barrier of complete.cu is reported here by ThreadSanitizer (build_emulation() tells how to use it).
     monkeypatch.setattr(cuda, "_CURVED_BLOCKS", 2)  # that take turns
     points, poses, weights, grid, transforms = scene(24, 0.8, dtype, batch=2, count=150, shape=(3, 4, 4))
     one = emulated.complete(points, transforms, grid, (3, 4, 4))
@@ -424,6 +424,19 @@ def test_queries_that_are_not_finite_or_far_away(runner):
     assert len(only[1]) == 0
 
 
+@pytest.mark.parametrize("axes", [0, 1, 2])
+def test_queries_on_a_point_a_line_and_a_plane(runner, axes):
+    points, _, _, grid, transforms = scene(6, 0.3, torch.float32, batch=1)
+    flat = points.clone()
+    flat[..., axes:] = points[:, :1, axes:]
+    flat[:, 0] = points[:, 0]
+    found = runner.complete(flat, transforms, grid, SHAPE)
+    alone = [runner.complete(flat[:, q : q + 1], transforms, grid, SHAPE) for q in range(0, 200, 20)]
+    for q, mine in zip(range(0, 200, 20), alone, strict=True):
+        assert torch.equal(found[0][found[1] == q], mine[0])
+    assert len(alone[0][1]) == 1
+
+
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e30, 0.0])
 def test_broken_transforms_give_no_root_and_spoil_no_other(runner, value):
     points, _, _, grid, transforms = scene(6, 0.3, torch.float32, batch=2)
@@ -527,3 +540,18 @@ def test_the_current_stream_and_device_are_used():
             box = grid.to(moved)
             found = cuda.complete_search(moved, transforms.to(device), box.lower, box.upper, SHAPE, None, 5e-6, 10, False, None)
         assert found[0].device == device and len(found[1]) >= 400
+
+
+@needs_gpu
+@pytest.mark.parametrize("search", ["complete", "broyden"])
+def test_correspondences_and_their_gradients_are_those_of_the_cpu(search):
+    points, poses, weights, grid, _ = scene(6, 0.3)
+    results = []
+    for device in ("cpu", "cuda"):
+        given = [value.detach().to(device).requires_grad_() for value in (points, poses, weights)]
+        found = find_correspondences(*given, grid.to(given[0]), search=search, backend="native", tolerance=1e-9, max_steps=30)
+        (found.canonical**2).sum().backward()  # on a thread of its own, which has no CUDA context yet
+        results.append([found.query.cpu(), found.canonical.detach().cpu(), *(value.grad.cpu() for value in given)])
+    assert torch.equal(results[0][0], results[1][0])
+    for mine, theirs in zip(results[1][1:], results[0][1:], strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=0, atol=1e-6 * max(1.0, float(theirs.abs().max())))

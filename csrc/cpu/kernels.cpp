@@ -404,6 +404,85 @@ template <class S> void broyden_queries(const BroydenTask<S>& task, int64_t firs
   }
 }
 
+// Twelve numbers as packs of lanes; what lies in the lanes beyond is read from behind them unless they are the last.
+template <class S> struct Row {
+  static constexpr int packs = (12 + Lanes<S>::width - 1) / Lanes<S>::width;
+  Lanes<S> pack[packs];
+
+  static Row load_from(const S* at, bool is_last) {
+    S copy[kRow];
+    if (is_last) {
+      for (int r = 0; r < kRow; ++r) copy[r] = r < 12 ? at[r] : S(0);
+      at = copy;
+    }
+    Row row;
+    for (int k = 0; k < packs; ++k) row.pack[k] = load<S>(at + k * Lanes<S>::width);
+    return row;
+  }
+
+  void store_to(S* at, bool is_last) const {
+    S copy[kRow];
+    S* const to = is_last ? copy : at;
+    for (int k = 0; k < packs; ++k) store(to + k * Lanes<S>::width, pack[k]);
+    if (is_last)
+      for (int r = 0; r < 12; ++r) at[r] = copy[r];
+  }
+};
+
+template <class S> void blend(const BlendTask<S>& task, S* transforms) {
+  for (int64_t pose = 0; pose < task.poses; ++pose) {
+    const S* const rows = task.rows + pose * task.bones * kRow;
+    S* const out = transforms + 12 * pose * task.nodes;
+    for (int64_t n = task.first; n < task.last; ++n) {
+      Row<S> sum;
+      for (auto& pack : sum.pack) pack = Lanes<S>(S(0));
+      if (!task.used || task.used[n]) {
+        const S* const weights = task.weights + n * task.bones;
+        for (int64_t j = 0; j < task.bones; ++j)
+          for (int k = 0; k < Row<S>::packs; ++k)
+            sum.pack[k] = sum.pack[k] + load<S>(rows + j * kRow + k * Lanes<S>::width) * weights[j];
+      }
+      // The lanes beyond the twelve are overwritten by the next node, except at the end of what this thread may write.
+      sum.store_to(out + 12 * n, n + 1 == task.last);
+    }
+  }
+}
+
+template <class S> void blend_weights(const BlendTask<S>& task, const S* gradient, S* row, S* v_weights) {
+  constexpr int width = Lanes<S>::width;
+  for (int64_t n = task.first; n < task.last; ++n) {
+    S* const out = v_weights + n * task.bones;
+    if (task.used && !task.used[n]) {
+      for (int64_t j = 0; j < task.bones; ++j) out[j] = S(0);
+      continue;
+    }
+    for (int64_t j = 0; j < task.columns; j += width) {
+      Lanes<S> sum = Lanes<S>(S(0));
+      for (int64_t pose = 0; pose < task.poses; ++pose) {
+        const S* const g = gradient + 12 * (pose * task.nodes + n);
+        const S* const rows = task.rows + pose * 12 * task.columns + j;
+        for (int r = 0; r < 12; ++r) sum = sum + load<S>(rows + r * task.columns) * g[r];
+      }
+      store(row + j, sum);
+    }
+    memcpy(out, row, size_t(task.bones) * sizeof(S));
+  }
+}
+
+template <class S> void blend_bones(const BlendTask<S>& task, const S* gradient, S* v_rows) {
+  for (int64_t pose = 0; pose < task.poses; ++pose)
+    for (int64_t n = task.first; n < task.last; ++n) {
+      if (task.used && !task.used[n]) continue;
+      const Row<S> g = Row<S>::load_from(gradient + 12 * (pose * task.nodes + n), n + 1 == task.nodes);
+      for (int64_t j = 0; j < task.bones; ++j) {
+        S* const out = v_rows + (pose * task.bones + j) * kRow;
+        const S weight = task.weights[n * task.bones + j];
+        for (int k = 0; k < Row<S>::packs; ++k)
+          store(out + k * Lanes<S>::width, load<S>(out + k * Lanes<S>::width) + g.pack[k] * weight);
+      }
+    }
+}
+
 template <class S> void backward(const BackwardTask<S>& task) {
   const Grid<S> grid = grid_of(task.geometry);
   const int64_t layer = int64_t(grid.nodes[0]) * grid.nodes[1];
@@ -431,7 +510,7 @@ template <class S> void backward(const BackwardTask<S>& task) {
 
 }  // namespace
 
-template <class S> Kernels<S> kernels() { return {extent<S>, bins<S>, boxes<S>, search<S>, broyden_queries<S>, backward<S>}; }
+template <class S> Kernels<S> kernels() { return {blend<S>, blend_weights<S>, blend_bones<S>, extent<S>, bins<S>, boxes<S>, search<S>, broyden_queries<S>, backward<S>}; }
 template Kernels<float> kernels<float>();
 template Kernels<double> kernels<double>();
 

@@ -89,7 +89,24 @@ template <class S> struct BackwardTask {
   int64_t layers[2];   // only nodes with z in [layers[0], layers[1]) are written
 };
 
+constexpr int kRow = 16;  // numbers that a transform's twelve take up in `rows`
+
+// Nodes first to last of a blend.
+template <class S> struct BlendTask {
+  const S* weights;     // [V, J]
+  const S* rows;        // transforms by bone, [B, J, kRow]; or by number, [B, 12, columns] (gradient of the weights)
+  const uint8_t* used;  // which nodes are blended, [V], or null for all
+  int64_t poses, bones, nodes, columns;
+  int64_t first, last;
+};
+
 template <class S> struct Kernels {
+  // transforms [B, V, 12] of the task's nodes.
+  void (*blend)(const BlendTask<S>&, S* transforms);
+  // v_weights [V, J] of the task's nodes, from the gradient by the transforms, [B, V, 12]; `row` has room for the columns.
+  void (*blend_weights)(const BlendTask<S>&, const S* gradient, S* row, S* v_weights);
+  // Adds the task's nodes to v_rows [B, J, kRow], the gradient by the bones.
+  void (*blend_bones)(const BlendTask<S>&, const S* gradient, S* v_rows);
   // Widens the box lower[3], upper[3] to hold `count` points [N, 3]; NaN is passed over.
   void (*extent)(const S* points, int64_t count, S* lower, S* upper);
   // Which bin each of `count` points [N, 3] lies in; -1 outside of the bins' region.

@@ -127,7 +127,8 @@ def find_correspondences(
         _check_values(bone_transforms, skinning_weights)
     grid = grid.to(points)
     depth, height, width = skinning_weights.shape[:3]
-    transforms = blend_transforms(skinning_weights, bone_transforms)
+    searched = active_cells if search == "complete" else None
+    transforms = blend_transforms(skinning_weights, bone_transforms, searched, backend)
     box = (grid.lower, grid.upper, [depth, height, width])
     common = (orientation_preserving, capacity, backend)
     if search == "complete":

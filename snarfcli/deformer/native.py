@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, Structure, byref, c_double, c_int32, c_int64, c_uint8, c_void_p
+from ctypes import Structure, byref, c_double, c_int32, c_int64, c_void_p
 
 import torch
 from torch import Tensor
 
 from snarfcli.deformer.library import native_library
 
-__all__ = ["broyden_search", "complete_search", "implicit_backward"]
+__all__ = ["blend", "blend_backward", "broyden_search", "complete_search", "implicit_backward"]
 
 
 class _Field(Structure):
@@ -29,7 +29,7 @@ class _Queries(Structure):
 
 class _Complete(Structure):
     _fields_ = [
-        ("active", POINTER(c_uint8)),
+        ("active", c_void_p),
         ("tolerance", c_double),
         ("max_steps", c_int32),
         ("orientation_preserving", c_int32),
@@ -46,6 +46,45 @@ class _Broyden(Structure):
         ("exact_jacobian", c_int32),
         ("orientation_preserving", c_int32),
     ]
+
+
+class _Blending(Structure):
+    _fields_ = [
+        ("weights", c_void_p),
+        ("bones", c_void_p),
+        ("active", c_void_p),
+        ("poses", c_int64),
+        ("count", c_int64),
+        ("nodes", c_int32 * 3),
+        ("bytes_per_number", c_int32),
+        ("threads", c_int32),
+    ]
+
+
+def blend(weights: Tensor, bones: Tensor, active: Tensor | None) -> Tensor:
+    """Blend bone transforms [B, J, 12] with the weights [D, H, W, J] of the grid's nodes to [B, D * H * W, 12].
+
+    With `active` [D-1, H-1, W-1] only the corners of these cells are blended; other nodes get zeros.
+    """
+    weights, bones, active = _blending_inputs(weights, bones, active)
+    out = weights.new_empty(len(bones), weights[..., 0].numel(), 12)
+    blending = _blending(weights, bones, active)
+    _raise_for(_library().snarf_blend(byref(blending), c_void_p(out.data_ptr())))
+    return out
+
+
+def blend_backward(
+    gradient: Tensor, weights: Tensor, bones: Tensor, active: Tensor | None, wants: tuple[bool, bool]
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients by the weights and by the bones from that by `blend`'s result; empty where not wanted."""
+    gradient = gradient.contiguous()
+    weights, bones, active = _blending_inputs(weights, bones, active)
+    v_weights = torch.empty_like(weights) if wants[0] else weights.new_empty(0)
+    v_bones = torch.empty_like(bones) if wants[1] else bones.new_empty(0)
+    blending = _blending(weights, bones, active)
+    results = [c_void_p(out.data_ptr() if wanted else None) for out, wanted in zip((v_weights, v_bones), wants, strict=True)]
+    _raise_for(_library().snarf_blend_backward(byref(blending), c_void_p(gradient.data_ptr()), *results))
+    return v_weights, v_bones
 
 
 def complete_search(
@@ -76,10 +115,9 @@ def complete_search(
         canonical [M, 3], query [M] (b * N + n, ascending) and the inverse of dd/dx, [M, 3, 3].
     """
     points, transforms = points.contiguous(), transforms.contiguous()
-    mask = None if active is None else active.to(torch.uint8).contiguous()
-    settings = _Complete(
-        None if mask is None else ctypes.cast(mask.data_ptr(), POINTER(c_uint8)), tolerance, max_steps, orientation_preserving
-    )
+    active = None if active is None else active.contiguous()
+    cells = None if active is None else active.data_ptr()
+    settings = _Complete(cells, tolerance, max_steps, orientation_preserving)
     field = _field(transforms, lower, size, shape)
     return _search("snarf_complete_search", field, points, settings)
 
@@ -148,6 +186,25 @@ def implicit_backward(
     )
     _raise_for(code)
     return v_points, v_transforms
+
+
+def _blending_inputs(weights: Tensor, bones: Tensor, active: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    return weights.contiguous(), bones.contiguous(), None if active is None else active.contiguous()
+
+
+def _blending(weights: Tensor, bones: Tensor, active: Tensor | None) -> _Blending:
+    """Describe contiguous inputs, which the caller keeps alive."""
+    depth, height, width, count = weights.shape
+    return _Blending(
+        weights.data_ptr(),
+        bones.data_ptr(),
+        None if active is None else active.data_ptr(),
+        len(bones),
+        count,
+        (c_int32 * 3)(width, height, depth),
+        weights.element_size(),
+        torch.get_num_threads(),
+    )
 
 
 def _library() -> ctypes.CDLL:

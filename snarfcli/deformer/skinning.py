@@ -28,12 +28,16 @@ def skin(canonical: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
     return (blended[:, :, :3] @ canonical[:, :, None])[:, :, 0] + blended[:, :, 3]
 
 
-def blend_transforms(skinning_weights: Tensor, bone_transforms: Tensor) -> Tensor:
+def blend_transforms(
+    skinning_weights: Tensor, bone_transforms: Tensor, active_cells: Tensor | None = None, backend: str = "auto"
+) -> Tensor:
     """Blend the bone transforms once per grid node and pose.
 
     Args:
         skinning_weights: [D, H, W, J] at the grid nodes.
         bone_transforms: [B, J, 4, 4], canonical to posed.
+        active_cells: bool [D-1, H-1, W-1]; other nodes than their corners may get zeros. None for all.
+        backend: "auto", "native" or "reference".
 
     Returns:
         The upper three rows of the blended transforms, flattened: [B, D * H * W, 12].
@@ -41,7 +45,7 @@ def blend_transforms(skinning_weights: Tensor, bone_transforms: Tensor) -> Tenso
     Source: Fast-SNARF Eq. 13.
     """
     bones = bone_transforms[:, :, :3].reshape(*bone_transforms.shape[:2], 12)
-    return blend(skinning_weights.reshape(-1, skinning_weights.shape[-1]), bones)
+    return blend(skinning_weights, bones, active_cells, backend)
 
 
 def interpolate(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:

@@ -199,21 +199,48 @@ def test_operators_keep_pytorchs_rules(search, requires_grad):
     torch.library.opcheck(operator, operator_arguments(search=search, requires_grad=requires_grad, count=6))
 
 
-def test_blending_is_exact_at_any_precision_the_caller_sets():
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("bones", [1, 3, 24, 55])
+def test_native_blending_and_its_gradient(bones, dtype, masked):
+    """Against the matrix product; nodes that no active cell touches get zeros and give no gradient."""
+    weights = smooth_weights(SHAPE, bones, 0, dtype)
+    rows = random_transforms(3, bones, 1.0, 0, dtype)[:, :, :3].reshape(3, bones, 12)
+    active = None
+    used = torch.ones(SHAPE, dtype=torch.bool)
+    if masked:
+        active = torch.rand([n - 1 for n in SHAPE], generator=torch.Generator().manual_seed(0)) < 0.1
+        used = torch.nn.functional.max_pool3d(torch.nn.functional.pad(active[None].float(), [1] * 6), 2, 1)[0] > 0
+    native = blend(weights, rows, active, "native")
+    expected = torch.where(used.reshape(1, -1, 1), blend(weights, rows, active, "reference"), 0.0)
+    tight = {"rtol": 1e-5, "atol": 1e-6} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-13}
+    assert torch.allclose(native, expected, **tight)
+    noise = torch.randn(native.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
+    gradient = torch.where(used.reshape(1, -1, 1), noise, 0.0)
+    mine = blend_backward(gradient, weights, rows, active, True, True, "native")
+    theirs = blend_backward(gradient, weights, rows, active, True, True, "reference")
+    for a, b in zip(mine, theirs, strict=True):
+        assert torch.allclose(a, b, rtol=tight["rtol"], atol=50 * tight["atol"])  # sums of 336 terms
+
+
+def test_blending_keeps_pytorchs_rules_and_full_precision():
     _, transforms, weights = scene(torch.float64)
     bones = transforms[:, :, :3].reshape(2, -1, 12).requires_grad_()
-    flat = weights.reshape(-1, weights.shape[-1]).requires_grad_()
-    torch.library.opcheck(blend, (flat, bones))
-    torch.library.opcheck(blend_backward, (torch.ones(2, len(flat), 12).double(), flat.detach(), bones.detach()))
-    assert torch.autograd.gradcheck(blend, (flat[:7].detach().requires_grad_(), bones.detach().requires_grad_()))
+    weights.requires_grad_()
+    active = torch.ones([n - 1 for n in SHAPE], dtype=torch.bool)
+    torch.library.opcheck(blend, (weights, bones, active, "native"))
+    gradient = torch.ones(2, weights[..., 0].numel(), 12, dtype=torch.float64)
+    torch.library.opcheck(blend_backward, (gradient, weights.detach(), bones.detach(), active, True, False, "native"))
+    small = weights[:2, :2, :2].detach().requires_grad_()
+    assert torch.autograd.gradcheck(lambda w, b: blend(w, b, None, "native"), (small, bones.detach().requires_grad_()))
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("medium")
     try:
-        rough = blend(flat.float(), bones.float())
+        rough = blend(weights.float(), bones.float(), None, "reference")
         assert torch.get_float32_matmul_precision() == "medium"
     finally:
         torch.set_float32_matmul_precision(before)
-    assert torch.allclose(rough.double(), blend(flat, bones), atol=1e-6)
+    assert torch.allclose(rough.double(), blend(weights, bones, None, "reference"), atol=1e-6)
 
 
 def test_backward_operator_keeps_pytorchs_rules():

@@ -50,11 +50,28 @@ typedef struct snarf_broyden {
   int32_t orientation_preserving;
 } snarf_broyden;
 
+/* Weights at the nodes and the transforms that they blend (Fast-SNARF Eq. 13). */
+typedef struct snarf_blending {
+  const void* weights;     /* [V, J] */
+  const void* bones;       /* upper three rows, [B, J, 12] */
+  const uint8_t* active;   /* [(D-1)(H-1)(W-1)]: only the corners of these cells are blended, others get zeros; null for all */
+  int64_t poses, count;    /* B, J */
+  int32_t nodes[3];        /* W, H, D */
+  int32_t bytes_per_number;
+  int32_t threads;         /* at most */
+} snarf_blending;
+
 typedef struct snarf_roots snarf_roots;
 
 SNARF_API int snarf_abi_version(void);
 /* Name of the instruction set in use: avx512, avx2 or baseline. SNARF_INSTRUCTION_SET in the environment may ask for a lower one. */
 SNARF_API const char* snarf_instruction_set(void);
+
+/* transforms [B, V, 12]. */
+SNARF_API int snarf_blend(const snarf_blending*, void* transforms);
+/* Gradients of a loss by the weights [V, J] and by the bones [B, J, 12] from that by the transforms [B, V, 12]; either result may be
+ * null, both are overwritten. */
+SNARF_API int snarf_blend_backward(const snarf_blending*, const void* gradient, void* v_weights, void* v_bones);
 
 SNARF_API int snarf_complete_search(const snarf_field*, const snarf_queries*, const snarf_complete*, snarf_roots** roots, int64_t* found);
 SNARF_API int snarf_broyden_search(const snarf_field*, const snarf_queries*, const snarf_broyden*, snarf_roots** roots, int64_t* found);

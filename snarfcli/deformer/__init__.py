@@ -3,22 +3,28 @@
 Usable alone, in any neural field: see `ForwardDeformer`.
 """
 
+from snarfcli.deformer.cells import cells_near
 from snarfcli.deformer.correspondences import Correspondences, find_correspondences
-from snarfcli.deformer.deformer import ForwardDeformer, SkinningConfig, cells_near
+from snarfcli.deformer.deformer import ForwardDeformer, SkinningConfig
+from snarfcli.deformer.diffusion import PresetWeights
+from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.search import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, skin
-from snarfcli.deformer.weights import BonePrior
+from snarfcli.deformer.weights import BonePrior, WeightField
 
 __all__ = [
     "BonePrior",
     "CanonicalGrid",
     "Correspondences",
     "ForwardDeformer",
+    "PresetWeights",
     "SearchConfig",
     "SkinningConfig",
+    "WeightField",
     "blend_transforms",
     "cells_near",
     "find_correspondences",
+    "find_correspondences_on_field",
     "skin",
 ]

@@ -1,4 +1,4 @@
-"""Weight fields: where the skinning weights at the grid nodes come from."""
+"""Weight fields: where the skinning weights of canonical points come from."""
 
 from __future__ import annotations
 
@@ -7,10 +7,22 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from snarfcli.deformer.grid import CanonicalGrid
+from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
 from snarfcli.segments import segment_distances
 
-__all__ = ["BonePrior", "DistilledWeights"]
+__all__ = ["BonePrior", "GridWeights", "NetworkWeights", "VoxelWeights", "WeightField", "total_variation"]
+
+
+class WeightField(nn.Module):
+    """Skinning weights of canonical points: the one thing that a deformer asks of its field.
+
+    A field is called with canonical points [N, 3], metres, and returns weights [N, J], non-negative, rows sum to 1. Each row
+    depends on its own point only. `ForwardDeformer` takes any other callable of this kind as well.
+    """
+
+    def set_box(self, grid: CanonicalGrid) -> None:
+        """Take over the canonical box that the deformer has read from a file."""
 
 
 class BonePrior(nn.Module):
@@ -39,23 +51,24 @@ class BonePrior(nn.Module):
         return start.scatter_reduce(1, owner, distances, "amin") / -self.falloff
 
 
-class DistilledWeights(nn.Module):
-    """Skinning weights as a small network that is evaluated at the grid nodes (Fast-SNARF Sec. 4.2).
+class NetworkWeights(WeightField):
+    """Skinning weights as a small network.
 
-    The network makes the field smooth; the search only ever sees its values at the nodes.
+    Evaluated at the grid nodes it makes the field smooth, and the search only ever sees its values at the nodes (Fast-SNARF
+    Sec. 4.2); searched directly it is SNARF's own field (SNARF Eq. 3).
 
     Args:
-        num_bones: J.
+        softmax: from logits to weights; says how many logits the network has.
         grid: its box; coordinates are scaled to [-1, 1] in it before they enter the network.
         width, depth: size of the hidden layers and their number.
         sharpness: factor before the softmax over the bones (20 in the released Fast-SNARF).
         weight_norm: whether the layers are weight-normalised, as in the papers.
-        prior: logits that the network only corrects; the field then starts as the prior alone.
+        prior: logits of a plain softmax that the network only corrects; the field then starts as the prior alone.
     """
 
     def __init__(
         self,
-        num_bones: int,
+        softmax: PlainSoftmax | HierarchicalSoftmax,
         grid: CanonicalGrid,
         width: int,
         depth: int,
@@ -64,7 +77,7 @@ class DistilledWeights(nn.Module):
         prior: BonePrior | None = None,
     ) -> None:
         super().__init__()
-        sizes = [3] + [width] * depth + [num_bones]
+        sizes = [3] + [width] * depth + [softmax.num_logits]
         layers = [nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
         if prior is not None:
             nn.init.normal_(layers[-1].weight, 0, 1e-4)
@@ -72,10 +85,16 @@ class DistilledWeights(nn.Module):
         if weight_norm:
             layers = [nn.utils.parametrizations.weight_norm(layer) for layer in layers]
         self.layers = nn.ModuleList(layers)
+        self.softmax = softmax
         self.sharpness = sharpness
         self.prior = prior
-        self.register_buffer("centre", (grid.lower + grid.upper) / 2, persistent=False)
-        self.register_buffer("half_extent", (grid.upper - grid.lower) / 2, persistent=False)
+        self.register_buffer("centre", torch.empty(0), persistent=False)
+        self.register_buffer("half_extent", torch.empty(0), persistent=False)
+        self.set_box(grid)
+
+    def set_box(self, grid: CanonicalGrid) -> None:
+        """Scale coordinates by another box."""
+        self.centre, self.half_extent = (grid.lower + grid.upper) / 2, (grid.upper - grid.lower) / 2
 
     def forward(self, canonical: Tensor) -> Tensor:
         """Return the skinning weights [N, J] at canonical points [N, 3], rows sum to 1."""
@@ -84,5 +103,93 @@ class DistilledWeights(nn.Module):
             h = nn.functional.softplus(layer(h), beta=100)
         logits = self.sharpness * self.layers[-1](h)
         if self.prior is not None:
-            logits = logits + self.prior(canonical)
-        return torch.softmax(logits, dim=-1)
+            logits = logits + self.softmax.invert(self.prior(canonical))
+        return self.softmax(logits)
+
+
+class GridWeights(WeightField):
+    """Weights that are defined at the grid nodes and trilinear between them.
+
+    Args:
+        grid: its box.
+        shape: nodes (D, H, W).
+    """
+
+    def __init__(self, grid: CanonicalGrid, shape: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.shape = shape
+        self.register_buffer("lower", grid.lower.clone(), persistent=False)
+        self.register_buffer("upper", grid.upper.clone(), persistent=False)
+
+    def set_box(self, grid: CanonicalGrid) -> None:
+        """Lay the nodes over another box."""
+        self.lower, self.upper = grid.lower.clone(), grid.upper.clone()
+
+    def at_nodes(self, nodes: Tensor | None = None) -> Tensor:
+        """Return the weights [..., J] at the nodes with flat indices [...], or of all nodes, [D * H * W, J]."""
+        raise NotImplementedError
+
+    def forward(self, canonical: Tensor) -> Tensor:
+        """Return the skinning weights [N, J] at canonical points [N, 3]; outside the box, those of its border."""
+        cell, local = locate(canonical, CanonicalGrid(self.lower, self.upper), self.shape)
+        phi = trilinear_weights(local.clamp(0, 1))
+        return (phi[..., None] * self.at_nodes(cell_corners(cell, self.shape))).sum(-2)
+
+
+class VoxelWeights(GridWeights):
+    """Weights that are optimised directly at the grid nodes.
+
+    Fast-SNARF Sec. 4.2 mentions this field, with a total-variation loss (`total_variation`), and found the distilled one
+    smoother and more accurate.
+
+    Args:
+        softmax: from logits to weights.
+        grid: its box.
+        shape: nodes (D, H, W).
+        sharpness: factor before the softmax, which makes steps of the optimiser as large as those of the distilled field.
+        prior: logits of a plain softmax to start from; without it all bones weigh the same everywhere.
+    """
+
+    def __init__(
+        self,
+        softmax: PlainSoftmax | HierarchicalSoftmax,
+        grid: CanonicalGrid,
+        shape: tuple[int, int, int],
+        sharpness: float,
+        prior: BonePrior | None = None,
+    ) -> None:
+        super().__init__(grid, shape)
+        self.softmax = softmax
+        self.sharpness = sharpness
+        nodes = grid.nodes(shape).reshape(-1, 3)
+        start = nodes.new_zeros(len(nodes), softmax.num_logits) if prior is None else softmax.invert(prior(nodes)) / sharpness
+        self.logits = nn.Parameter(start.detach().clone())
+
+    def at_nodes(self, nodes: Tensor | None = None) -> Tensor:
+        """Return the weights [..., J] at the nodes with flat indices [...], or of all nodes, [D * H * W, J]."""
+        return self.softmax(self.sharpness * (self.logits if nodes is None else self.logits[nodes]))
+
+
+def total_variation(weights: Tensor, grid: CanonicalGrid, used: Tensor | None = None) -> Tensor:
+    """Return how much weights change from node to node, per metre: summed over bones and axes, averaged over neighbours.
+
+    The same field has the same value on a finer grid.
+
+    Args:
+        weights: [D, H, W, J] at the grid nodes.
+        grid: the box of the nodes.
+        used: bool [D, H, W]; pairs with a node outside are left out. None for all.
+
+    Source: the regulariser that Fast-SNARF Sec. 4.2 mentions; the norm is ours.
+    """
+    size = grid.cell_size(weights.shape[:3])
+    total = weights.new_zeros(())
+    for axis in range(3):  # z, y, x
+        count = weights.shape[axis] - 1
+        change = (weights.narrow(axis, 1, count) - weights.narrow(axis, 0, count)).abs().sum(-1) / size[2 - axis]
+        if used is None:
+            total = total + change.mean()
+        else:
+            pairs = used.narrow(axis, 1, count) & used.narrow(axis, 0, count)
+            total = total + (change * pairs).sum() / pairs.sum().clamp_min(1)
+    return total

@@ -15,7 +15,8 @@ from snarfcli.models.fast_snarf import NO_CORRESPONDENCE, ModelConfig, blend
 
 def correspondences(query, batch, count):
     query = torch.tensor(query)
-    return Correspondences(torch.zeros(len(query), 3), query, torch.zeros(len(query), 3, 3), batch, count)
+    total = torch.tensor([len(query)])
+    return Correspondences(torch.zeros(len(query), 3), query, torch.zeros(len(query), 3, 3), batch, count, total)
 
 
 @pytest.mark.parametrize("kind", ["logit", "probability"])

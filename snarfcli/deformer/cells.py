@@ -1,0 +1,37 @@
+"""Which grid cells are searched: sets of cells and what they are made from."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from snarfcli.deformer.grid import CanonicalGrid
+from snarfcli.segments import distance_to_segments
+
+__all__ = ["cells_near", "corners_of"]
+
+
+def cells_near(grid: CanonicalGrid, shape: tuple[int, int, int], places: list[tuple[Tensor, float]]) -> Tensor:
+    """Return which cells have a corner near one of several places, bool [D-1, H-1, W-1].
+
+    Args:
+        grid: canonical box.
+        shape: nodes (D, H, W).
+        places: segments [S, 2, 3], metres, each with the distance that still counts as near, metres. A point is a segment
+            of no length.
+    """
+    nodes = grid.nodes(shape).reshape(-1, 3)
+    near = torch.zeros(len(nodes), dtype=torch.bool, device=nodes.device)
+    for segments, radius in places:
+        for some in segments.split(256):  # bounds the memory
+            near |= distance_to_segments(nodes, some) < radius
+    return torch.nn.functional.max_pool3d(near.reshape(1, 1, *shape).float(), 2, stride=1)[0, 0] > 0
+
+
+def corners_of(cells: Tensor) -> Tensor:
+    """Return which nodes are corners of the given cells [D-1, H-1, W-1], bool [D, H, W]."""
+    used = cells.new_zeros([n + 1 for n in cells.shape])
+    for corner in range(8):
+        x, y, z = corner & 1, corner >> 1 & 1, corner >> 2 & 1
+        used[z : z + cells.shape[0], y : y + cells.shape[1], x : x + cells.shape[2]] |= cells
+    return used

@@ -1,0 +1,253 @@
+"""The search on a callable weight field: real roots, those of a finely sampled grid, and exact implicit gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from skinning_scenes import random_transforms, unit_grid
+from torch import nn
+
+from snarfcli.deformer import CanonicalGrid, find_correspondences, find_correspondences_on_field, skin
+
+BONES = 4
+
+
+class DistanceField(nn.Module):
+    """A softmax of distances to bone centres, which are its parameters."""
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.centres = nn.Parameter(2 * torch.rand(BONES, 3, generator=generator, dtype=torch.float64) - 1)
+        self.largest_call = 0
+
+    def forward(self, x):
+        self.largest_call = max(self.largest_call, len(x))
+        distance = ((x[:, None] - self.centres.to(x)).square().sum(-1) + 1e-3).sqrt()
+        return torch.softmax(-4 * distance, -1)
+
+
+@pytest.fixture
+def scene():
+    """Return a field, transforms [2, J, 4, 4] of mild poses and queries [2, 40, 3] that have a root."""
+    field, transforms = DistanceField(), random_transforms(2, BONES, 0.25)
+    generator = torch.Generator().manual_seed(1)
+    canonical = 1.6 * torch.rand(2, 40, 3, generator=generator, dtype=torch.float64) - 0.8
+    with torch.no_grad():
+        points = torch.stack([skin(x, field(x), pose) for x, pose in zip(canonical, transforms, strict=True)])
+    return field, transforms, points
+
+
+def posed(found, field, transforms):
+    """Return the roots moved back to the posed frame, [M, 3]."""
+    with torch.no_grad():
+        rows = [skin(x[None], field(x[None]), transforms[int(b)]) for x, b in zip(found.canonical, found.pose, strict=True)]
+    return torch.cat(rows)
+
+
+@pytest.mark.parametrize("start_jacobian", ["exact", "blended"])
+@pytest.mark.parametrize("angle", [0.3, 1.0])
+def test_every_result_is_a_root_once_and_in_order(angle, start_jacobian):
+    field, transforms = DistanceField(), random_transforms(3, BONES, angle)
+    points = 2 * torch.rand(3, 150, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 1
+    found = find_correspondences_on_field(points, transforms, field, tolerance=1e-9, start_jacobian=start_jacobian)
+    assert len(found.query) > 300 and int(found.total) == len(found.query)
+    assert bool((found.query[1:] >= found.query[:-1]).all())
+    residual = posed(found, field, transforms) - points.reshape(-1, 3)[found.query]
+    assert float(residual.norm(dim=1).max()) < 1e-9
+    same = found.query[1:] == found.query[:-1]
+    assert bool(((found.canonical[1:] - found.canonical[:-1])[same].norm(dim=1) > 1e-6).all())
+    assert found.padded()[0].shape[:2] == (3, 150)
+
+
+def test_roots_are_those_of_a_fine_grid(scene):
+    field, transforms, points = scene
+    grid = unit_grid()
+    with torch.no_grad():
+        weights = field(grid.nodes((81, 81, 81)).reshape(-1, 3)).reshape(81, 81, 81, BONES)
+    wanted = find_correspondences(points, transforms, weights, grid)
+    found = find_correspondences_on_field(points, transforms, field, grid=grid, tolerance=1e-9)
+    assert torch.equal(found.query, wanted.query) and len(found.query) >= 80
+    # Cells of 2.5 cm: what the trilinear field leaves out
+    torch.testing.assert_close(found.canonical, wanted.canonical, atol=2e-3, rtol=0)
+    difference = (found.jacobian_inverse - wanted.jacobian_inverse).flatten(1).norm(dim=1)
+    error = difference / wanted.jacobian_inverse.flatten(1).norm(dim=1)
+    assert float(error.median()) < 1e-2 and float(error.max()) < 0.1
+
+
+def test_single_precision_is_as_good(scene):
+    field, transforms, points = scene
+    wanted = find_correspondences_on_field(points, transforms, field, tolerance=1e-9)
+    found = find_correspondences_on_field(points.float(), transforms.float(), field)
+    assert found.canonical.dtype == torch.float32 and torch.equal(found.query, wanted.query)
+    torch.testing.assert_close(found.canonical.double(), wanted.canonical, atol=5e-6, rtol=0)
+
+
+def test_chunks_change_nothing(scene):
+    field, transforms, points = scene
+    kept = {}
+    for at_once in (7, 100_000):
+        field.zero_grad()
+        field.largest_call = 0
+        queries = points.clone().requires_grad_()
+        found = find_correspondences_on_field(queries, transforms, field, tolerance=1e-9, points_at_once=at_once)
+        assert field.largest_call <= max(at_once, BONES)
+        found.canonical.sin().sum().backward()
+        kept[at_once] = found.canonical.detach(), queries.grad, field.centres.grad.clone()
+    for few, many in zip(*kept.values(), strict=True):
+        torch.testing.assert_close(few, many, atol=1e-9, rtol=1e-9)
+
+
+def test_gradcheck():
+    """To the points, the transforms and the field's parameters, by differences of the whole search."""
+    field, transforms = DistanceField(), random_transforms(2, BONES, 0.15)
+    points = 0.6 * torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 0.3
+
+    def roots(points, upper, centres):
+        bottom = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(2, BONES, 1, 4)
+
+        def with_centres(x):
+            return torch.func.functional_call(field, {"centres": centres}, x)
+
+        whole = torch.cat([upper, bottom], 2)
+        return find_correspondences_on_field(points, whole, with_centres, tolerance=1e-12).canonical
+
+    inputs = points, transforms[:, :, :3].clone(), field.centres.detach().clone()
+    assert roots(*inputs).shape == (6, 3)
+    assert torch.autograd.gradcheck(roots, tuple(x.requires_grad_() for x in inputs), eps=1e-6, atol=1e-5)
+
+
+def test_gradient_of_a_network_equals_differences(scene):
+    """A small network as the field; its parameters moved along a random direction."""
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(3, 16), nn.Softplus(beta=10), nn.Linear(16, BONES), nn.Softmax(-1)).double()
+    _, transforms, points = scene
+
+    def loss():
+        return find_correspondences_on_field(points, transforms, network, tolerance=1e-12).canonical.sin().sum()
+
+    for parameter in network.parameters():
+        (gradient,) = torch.autograd.grad(loss(), parameter)
+        direction = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        values = []
+        for step in (1e-6, -1e-6):
+            with torch.no_grad():
+                parameter += step * direction
+                values.append(float(loss()))
+                parameter -= step * direction
+        assert float((gradient * direction).sum()) == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-5, abs=1e-7)
+
+
+def test_approximate_jacobian_is_near_but_not_equal(scene):
+    field, transforms, points = scene
+    exact = find_correspondences_on_field(points, transforms, field)
+    rough = find_correspondences_on_field(points, transforms, field, jacobian="broyden")
+    torch.testing.assert_close(exact.canonical, rough.canonical, atol=1e-4, rtol=0)
+    error = (exact.jacobian_inverse - rough.jacobian_inverse).norm() / exact.jacobian_inverse.norm()
+    assert 1e-6 < error < 0.3
+
+
+def test_second_derivative_is_refused(scene):
+    field, transforms, points = scene
+    points = points.clone().requires_grad_()
+    found = find_correspondences_on_field(points, transforms, field)
+    (first,) = torch.autograd.grad(found.canonical.square().sum(), points, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.sum().backward()
+
+
+def test_works_wherever_autograd_is_off_and_under_autocast(scene):
+    field, transforms, points = scene
+    wanted = find_correspondences_on_field(points, transforms, field).canonical
+    assert wanted.requires_grad
+    with torch.no_grad():
+        plain = find_correspondences_on_field(points, transforms, field).canonical
+    with torch.inference_mode():
+        inference = find_correspondences_on_field(points + 0, transforms + 0, field).canonical
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = find_correspondences_on_field(points.float(), transforms.float(), field).canonical
+    for other in (plain, inference):
+        assert not other.requires_grad and torch.equal(other, wanted)
+    assert cast.dtype == torch.float32
+    torch.testing.assert_close(cast.double(), wanted, atol=5e-6, rtol=0)
+
+
+def test_rigid_fields_have_one_root_each():
+    """One bone everywhere: the root is B^-1 x', whatever other bones start the search; weights may be constants."""
+    transforms = random_transforms(1, BONES, 1.0)
+    points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    only = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+    found = find_correspondences_on_field(points, transforms, lambda x: only.expand(len(x), -1), divergence=100.0)
+    inverse = torch.linalg.inv(transforms[0, 1])
+    assert found.query.tolist() == list(range(20))
+    torch.testing.assert_close(found.canonical, points[0] @ inverse[:3, :3].T + inverse[:3, 3])
+
+
+def test_points_without_a_root_and_points_that_are_none(scene):
+    field, transforms, points = scene
+    points = points.clone()
+    points[0, 3], points[1, 0, 2] = torch.nan, torch.inf
+    points[1, 5] = 1e6
+    box = CanonicalGrid(torch.full((3,), -1.0), torch.full((3,), 1.0))
+    found = find_correspondences_on_field(points, transforms, field, grid=box)
+    assert not bool(found.found[0, 3]) and not bool(found.found[1, 0]) and not bool(found.found[1, 5])
+    assert int(found.found.sum()) == 77
+    assert bool((found.canonical.abs() <= 1).all())
+
+
+def test_a_box_keeps_roots_outside_away(scene):
+    field, transforms, points = scene
+    half = CanonicalGrid(torch.full((3,), -2.0), torch.tensor([0.0, 2.0, 2.0]))
+    everywhere = find_correspondences_on_field(points, transforms, field)
+    inside = find_correspondences_on_field(points, transforms, field, grid=half)
+    assert 0 < len(inside.query) < len(everywhere.query)
+    assert bool((inside.canonical[:, 0] <= 0).all())
+    assert set(inside.query.tolist()) == set(everywhere.query[everywhere.canonical[:, 0] < 0].tolist())
+
+
+def test_start_bones_and_orientation():
+    field, transforms = DistanceField(), random_transforms(1, BONES, 1.2)
+    points = 2 * torch.rand(1, 300, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64) - 1
+    every = find_correspondences_on_field(points, transforms, field)
+    one = find_correspondences_on_field(points, transforms, field, init_bones=[2])
+    upright = find_correspondences_on_field(points, transforms, field, orientation_preserving=True)
+    assert len(one.query) < len(every.query) and bool((torch.bincount(one.query) <= 1).all())
+    positive = torch.linalg.det(every.jacobian_inverse) > 0
+    assert 0 < int(positive.sum()) < len(positive)
+    assert torch.equal(upright.query, every.query[positive])
+
+
+@pytest.mark.parametrize(("batch", "count"), [(0, 5), (2, 0), (1, 1)])
+def test_few_points(batch, count):
+    field, transforms = DistanceField(), random_transforms(batch, BONES, 0.2)
+    points = torch.zeros(batch, count, 3, dtype=torch.float64, requires_grad=True)
+    found = find_correspondences_on_field(points, transforms, field)
+    assert found.found.shape == (batch, count) and int(found.found.sum()) == batch * count * (count == 1)
+    found.canonical.sum().backward()
+    assert points.grad.shape == points.shape
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"points": torch.zeros(3, 3)}, r"points must have shape \[B, N, 3\], got \[3, 3\]"),
+        ({"bone_transforms": torch.zeros(2, 4, 4)}, r"bone_transforms must have shape \[1, J, 4, 4\] to fit points"),
+        ({"bone_transforms": torch.zeros(1, 4, 4, 4)}, "finite and invertible"),
+        ({"bone_transforms": torch.full((1, 4, 4, 4), torch.nan)}, "finite and invertible"),
+        ({"bone_transforms": torch.zeros(1, 4, 4, 4).double()}, "dtype of points, torch.float32, got torch.float64"),
+        ({"points": torch.zeros(1, 2, 3).half()}, "points must be float32 or float64"),
+        ({"field": lambda x: x}, r"field must return weights of shape \[8, 4\], got \[8, 3\]"),
+        ({"init_bones": []}, "init_bones must name at least one bone"),
+        ({"init_bones": [4]}, r"init_bones must lie in 0..3, got \[4\]"),
+        ({"jacobian": "rough"}, "jacobian must be 'exact' or 'broyden', got 'rough'"),
+        ({"start_jacobian": "rough"}, "start_jacobian must be 'exact' or 'blended', got 'rough'"),
+        ({"tolerance": 0.0}, "tolerance must be positive, got 0.0"),
+        ({"points_at_once": 0}, "points_at_once must be positive"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_named(changes, message):
+    arguments = {
+        "points": torch.zeros(1, 2, 3), "bone_transforms": torch.eye(4).expand(1, 4, 4, 4), "field": DistanceField()
+    }  # fmt: skip
+    with pytest.raises((ValueError, TypeError), match=message):
+        find_correspondences_on_field(**(arguments | changes))

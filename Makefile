@@ -8,15 +8,16 @@ SNARF := $(VENV)/bin/snarf
 SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
 
-.PHONY: help setup demo test lint bench clean
+.PHONY: help setup demo test sanitize lint bench clean
 
 help:
-	@echo "make setup   install snarf into $(VENV)"
-	@echo "make demo    the whole job on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
-	@echo "make test    run the tests"
-	@echo "make lint    check the style of the code"
-	@echo "make bench   measure a training step, evaluation and mesh extraction"
-	@echo "make clean   remove .venv, samples and results"
+	@echo "make setup     install snarf into $(VENV)"
+	@echo "make demo      the whole job on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
+	@echo "make test      run the tests"
+	@echo "make sanitize  run the deformer's tests on a library built with address and undefined-behaviour checks (Linux)"
+	@echo "make lint      check the style of the code"
+	@echo "make bench     measure a training step, evaluation and mesh extraction"
+	@echo "make clean     remove .venv, builds, samples and results"
 
 setup: $(INSTALLED)
 
@@ -35,6 +36,9 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	$(VENV)/bin/python -m pytest -q -n auto
 
+sanitize: $(INSTALLED)
+	tools/sanitize.sh $(VENV)
+
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
 
@@ -44,4 +48,4 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_extraction.py
 
 clean:
-	rm -rf .venv data/processed outputs
+	rm -rf .venv build data/processed outputs

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 from snarfcli.errors import UserError, nearest
 
 if TYPE_CHECKING:
-    from snarfcli.deformer import SearchConfig
+    from snarfcli.deformer import SearchConfig, SkinningConfig
 
-__all__ = ["check_choice", "check_number", "check_search"]
+__all__ = ["check_choice", "check_number", "check_search", "check_skinning"]
 
 _SEARCHES = ("complete", "broyden")
 _JACOBIANS = ("exact", "broyden")
+_FIELDS = ("distilled", "voxel", "mlp", "preset")
+_SOFTMAXES = ("plain", "hierarchical")
 
 
 def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
@@ -59,3 +61,34 @@ def check_search(search: SearchConfig) -> None:
     for name, value in (("tolerance", search.tolerance), ("divergence", search.divergence)):
         if not 0 < value < math.inf:
             raise UserError(f"search.{name} must be positive, got {value}")
+
+
+def check_skinning(skinning: SkinningConfig, search: SearchConfig) -> None:
+    """Refuse settings of the weight field that cannot be used, or that do not go with the search.
+
+    Raises:
+        UserError: one does not fit.
+    """
+    check_choice("skinning.name", skinning.name, _FIELDS)
+    check_choice("skinning.softmax", skinning.softmax, _SOFTMAXES)
+    for name, least in (("resolution", 2), ("margin_m", 0)):
+        values = getattr(skinning, name)
+        if len(values) != 3:
+            raise UserError(f"skinning.{name} must be three numbers, along x, y and z, got {values}")
+        for value in values:
+            check_number(f"skinning.{name}", value, least)
+    for name in ("width", "depth"):
+        check_number(f"skinning.{name}", getattr(skinning, name), 1)
+    check_number("skinning.smoothness", skinning.smoothness, 0)
+    for name in ("sharpness", "prior_falloff_m"):
+        value = getattr(skinning, name)
+        if value is not None and not 0 < value < math.inf:
+            raise UserError(f"skinning.{name} must be positive, got {value}")
+    if skinning.smoothness and skinning.name != "voxel":
+        raise UserError("skinning.smoothness is for skinning=voxel; the other fields are smooth by themselves")
+    if skinning.weights_file is not None and skinning.name != "preset":
+        raise UserError("skinning.weights_file is for skinning=preset; the other fields are learned")
+    if skinning.name == "preset" and skinning.weights_file is None:
+        raise UserError("skinning=preset needs skinning.weights_file=FILE, an .npz file with vertices and weights")
+    if skinning.name == "mlp" and search.name != "broyden":
+        raise UserError("skinning=mlp has no cells to search; leave search out, or give search=snarf or search=broyden")

@@ -74,7 +74,7 @@ WRONG = {
     ("train", "training.precision=half"): "training.precision must be highest or high or medium or bfloat16, got 'half'",
     ("train", "skinning.resolution=[8,8]"): "skinning.resolution must be three numbers, along x, y and z, got [8, 8]",
     ("train", "search.jacobian=exat"): "search.jacobian must be exact or broyden, got 'exat'; did you mean 'exact'?",
-    ("eval", "search=null"): "there is no search=null; choose from broyden, complete, or leave it out",
+    ("eval", "search=null"): "there is no search=null; choose from broyden, complete, snarf, or leave it out",
     ("train", "50002"): "'50002' is no setting; write name=value",
     ("train", "subject='unclosed"): "cannot read \"subject='unclosed\"",
     ("train", "device=gpu"): "device must be auto, cpu, cuda or cuda:N, got 'gpu'",

@@ -83,7 +83,10 @@ def run(config: EvalConfig) -> None:
     avatar = Avatar.load(path, device)
     _check_match(avatar, store, config)
     if config.search is not None:
-        avatar.model.deformer.search = config.search
+        try:
+            avatar.model.deformer.search = config.search
+        except ValueError as error:
+            raise UserError(f"{error}; leave search out, or give search=snarf") from None
     search = avatar.model.deformer.search
     folder = path.parent / _folder_name(config, avatar)
     _check_writable(folder)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from omegaconf import MISSING, OmegaConf
 
-from snarfcli.checks import check_choice, check_number, check_search
+from snarfcli.checks import check_choice, check_number, check_search, check_skinning
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.store import SampleStore, samples_folder
 from snarfcli.datasets.subjects import check_subject
@@ -21,6 +21,7 @@ from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
 from snarfcli.models.avatar import Avatar, load_checkpoint
 from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
+from snarfcli.models.preset import read_preset_weights
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.shape import ShapeConfig
@@ -37,7 +38,7 @@ log = logging.getLogger(__name__)
 _AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every")
 _NOT_NEGATIVE = (
     "uniform_points", "surface_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight", "joint_weight",
-    "validation_frames",
+    "validation_frames", "refresh_cells_every",
 )  # fmt: skip
 
 
@@ -127,9 +128,9 @@ def run(config: TrainConfig) -> None:
         except KeyboardInterrupt:
             log.info("stopped at step %d; continue with resume=true", trainer.step)
             raise
-    averaged = trainer.averaged_avatar()
-    averaged.facts |= {"steps": trainer.step, "validation": result["validation"]}
-    averaged.save(folder / "avatar.pt")
+    finished = trainer.finished_avatar()
+    finished.facts |= {"steps": trainer.step, "validation": result["validation"]}
+    finished.save(folder / "avatar.pt")
     write_json(folder / "metrics.json", _metrics(config, result, trainer, time.time() - start))
     validation = result["validation"]
     if validation:
@@ -155,17 +156,10 @@ def _check(config: TrainConfig) -> None:
     check_number("training.average_decay", training.average_decay, 0, 1)
     check_choice("training.precision", training.precision, PRECISIONS)
     check_choice("training.joint_target", training.joint_target, JOINT_TARGETS)
-    check_choice("skinning.name", config.skinning.name, ("distilled",))
     check_choice("shape.name", config.shape.name, ("mlp",))
-    for name, least in (("resolution", 2), ("margin_m", 0)):
-        values = getattr(config.skinning, name)
-        if len(values) != 3:
-            raise UserError(f"skinning.{name} must be three numbers, along x, y and z, got {values}")
-        for value in values:
-            check_number(f"skinning.{name}", value, least)
-    for group in ("skinning", "shape"):
-        for name in ("width", "depth"):
-            check_number(f"{group}.{name}", getattr(getattr(config, group), name), 1)
+    for name in ("width", "depth"):
+        check_number(f"shape.{name}", getattr(config.shape, name), 1)
+    check_skinning(config.skinning, config.search)
     check_search(config.search)
     check_number("seed", config.seed, 0)
 
@@ -173,12 +167,18 @@ def _check(config: TrainConfig) -> None:
 def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -> Trainer:
     """Return a fresh avatar of the store's subject in the hands of a trainer."""
     surface = rough_canonical_surface(store)
+    grid = CanonicalGrid.around(surface, config.skinning.margin_m)
+    field = None
+    if config.skinning.name == "preset":
+        shape = tuple(config.skinning.resolution[::-1])
+        field = read_preset_weights(config.skinning.weights_file, grid, shape, store.skeleton.num_joints)
     avatar = Avatar(
         AvatarConfig(config.model, config.skinning, config.search, config.shape),
         store.skeleton,
-        CanonicalGrid.around(surface, config.skinning.margin_m),
+        grid,
         surface,
         {"data": store.data, "subject": store.subject, "seed": config.seed, "training": config.training.name},
+        field,
     )
     return Trainer(avatar, store, config.training, config.seed, device)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,8 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 
 from snarfcli.bodies import Skeleton
-from snarfcli.deformer import CanonicalGrid
-from snarfcli.deformer.grid import locate
+from snarfcli.deformer import CanonicalGrid, PresetWeights
 from snarfcli.errors import UserError
 from snarfcli.files import write_tensors
 from snarfcli.models.fast_snarf import NO_CORRESPONDENCE, AvatarConfig, FastSnarf, FieldSamples
@@ -26,7 +26,7 @@ __all__ = ["Avatar", "load_checkpoint"]
 FORMAT = "snarf-avatar"
 FORMAT_VERSION = 1
 _MODELS = {"fast_snarf": FastSnarf}
-_THINNEST_PART_M = 0.02  # spacing at which the canonical shape is looked for, about a finger
+_SURFACE_MOVES_M = 0.06  # how far the pose may move the canonical surface
 
 
 class Avatar:
@@ -38,6 +38,7 @@ class Avatar:
         grid: canonical box that holds the body.
         surface: rough canonical surface points, [K, 3], metres, for a new avatar; a saved one knows where to search.
         facts: plain facts about its making (data, subject, steps, ...), saved with it.
+        field: weight field of a new avatar instead of the one that `config.skinning` describes; preset weights need it.
     """
 
     def __init__(
@@ -47,6 +48,7 @@ class Avatar:
         grid: CanonicalGrid,
         surface: Tensor | None = None,
         facts: dict[str, Any] | None = None,
+        field: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if config.model.name not in _MODELS:
             raise ValueError(f"model.name must be one of {', '.join(_MODELS)}, got {config.model.name!r}")
@@ -54,7 +56,7 @@ class Avatar:
         self.skeleton = skeleton
         self.facts = dict(facts or {})
         surface = skeleton.canonical_joints if surface is None else surface
-        self.model = _MODELS[config.model.name](config, skeleton, grid, surface)
+        self.model = _MODELS[config.model.name](config, skeleton, grid, surface, field)
         self._body_cells: Tensor | None = None
 
     # ---------------------------------------------------------------- files
@@ -90,7 +92,11 @@ class Avatar:
         try:
             config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"]))
             grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
-            avatar = cls(config, Skeleton.from_dict(content["skeleton"]), grid, facts=content["facts"])
+            skeleton = Skeleton.from_dict(content["skeleton"])
+            field = None
+            if config.skinning.name == "preset":
+                field = PresetWeights.placeholder(grid, tuple(config.skinning.resolution[::-1]), skeleton.num_joints)
+            avatar = cls(config, skeleton, grid, facts=content["facts"], field=field)
             avatar.model.load_state_dict(content["state"])
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OmegaConfBaseException) as error:
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
@@ -99,7 +105,10 @@ class Avatar:
         return avatar
 
     def to(self, device: str | torch.device) -> Avatar:
-        """Move the avatar to a device and freeze its skinning weights there."""
+        """Move the avatar to a device and freeze its skinning weights there.
+
+        The frozen grid of weights that are searched directly (skinning.name "mlp") serves for `posed_box` alone.
+        """
         self.model.to(device).eval()
         self.model.deformer.freeze()
         self._body_cells = None
@@ -149,7 +158,7 @@ class Avatar:
 
     @torch.no_grad()
     def skinning_weights(self, canonical: Tensor) -> Tensor:
-        """Return the learned skinning weights [N, J] at canonical points [N, 3]."""
+        """Return the skinning weights [N, J] at canonical points [N, 3]."""
         return self.model.deformer.skinning_weights(canonical.to(self.device))
 
     @torch.no_grad()
@@ -165,24 +174,17 @@ class Avatar:
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
         """Return the corners (lower [3], upper [3]) of a box that holds the whole body in one pose [J, 4, 4], metres.
 
-        It bounds the images of all cells that the canonical shape touches, and of their neighbours.
+        It bounds the images of all cells within 6 cm of the canonical shape.
         """
         if self._body_cells is None:
             self._body_cells = self._cells_of_body()
         return self.model.deformer.posed_box(bone_transforms.to(self.device), self._body_cells)
 
     def _cells_of_body(self) -> Tensor:
-        """Return which grid cells the canonical shape touches in the canonical pose, or neighbours, bool [D-1, H-1, W-1]."""
-        deformer = self.model.deformer
-        finer = (deformer.grid.cell_size(deformer.shape) / _THINNEST_PART_M).ceil().long().tolist()
-        shape = [(n - 1) * factor + 1 for n, factor in zip(deformer.shape, reversed(finer), strict=True)]
-        points = deformer.grid.nodes(shape).reshape(-1, 3)
-        inside = points[self.canonical_logits(points, self.skeleton.canonical_pose.float()) > 0]
-        touched = torch.zeros_like(deformer.active_cells)
-        touched.view(-1)[locate(inside, deformer.grid, deformer.shape)[0]] = True
-        # One cell further, since the pose moves the surface a little.
-        touched = torch.nn.functional.max_pool3d(touched[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0
-        return touched if bool(touched.any()) else deformer.active_cells
+        """Return which grid cells the canonical shape touches in the canonical pose, or nearly, bool [D-1, H-1, W-1]."""
+        pose = self.skeleton.canonical_pose[None].float().to(self.device)
+        touched = self.model.occupied_cells(pose, reach_m=_SURFACE_MOVES_M)
+        return touched if bool(touched.any()) else self.model.deformer.active_cells
 
     def mesh(
         self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field"

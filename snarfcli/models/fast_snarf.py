@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import (
@@ -18,6 +20,7 @@ from snarfcli.deformer import (
     SkinningConfig,
     cells_near,
 )
+from snarfcli.deformer.cells import corners_of
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.precision import network_precision
 from snarfcli.shape import OccupancyNetwork, ShapeConfig
@@ -28,6 +31,12 @@ NO_CORRESPONDENCE = -30.0
 """Logit of a point that no canonical point is moved onto: certainly outside."""
 
 _POINTS_AT_ONCE = 32_768  # canonical points in one call of the shape network; smaller calls stay in the cache
+_SAMPLES_M = 0.04  # most distance of the samples that judge a cell; a wrist is 5 cm thick
+_KEPT_RADIUS_M = 0.1  # cells with a corner this near to a bone are searched whatever the field says
+_GROWTH_M = 0.06  # how far the cells searched in training reach beyond what might be occupied
+_GROWTH_LOGIT = -3.0  # what might be occupied in training: 5 %
+_FINAL_M = 0.04
+_FINAL_LOGIT = -2.0  # what might be occupied afterwards, in a pose not sampled: 12 %
 
 
 @dataclass
@@ -74,24 +83,36 @@ class FastSnarf(nn.Module):
         config: architecture.
         skeleton: joint tree and canonical pose.
         grid: canonical box of the skinning weights.
-        surface: rough canonical surface points, [K, 3], metres; with the bones they say where to search.
+        surface: rough canonical surface points, [K, 3], metres; with the bones they say where to search at first.
+        field: weight field to use instead of the one that `config.skinning` describes; preset weights need it.
     """
 
-    def __init__(self, config: AvatarConfig, skeleton: Skeleton, grid: CanonicalGrid, surface: Tensor) -> None:
+    def __init__(
+        self,
+        config: AvatarConfig,
+        skeleton: Skeleton,
+        grid: CanonicalGrid,
+        surface: Tensor,
+        field: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
         super().__init__()
         if config.model.blend not in ("logit", "probability"):
             raise ValueError(f"model.blend must be logit or probability, got {config.model.blend!r}")
         self.config = config
         skinning, bones, num_bones = config.skinning, bone_segments(skeleton), skeleton.num_joints
-        active = prior = None
+        active = kept = prior = None
         if skinning.bone_radius_m is not None:
             width, height, depth = skinning.resolution
             points = surface[:, None].expand(-1, 2, -1)
             places = [(bones, skinning.bone_radius_m), (points, skinning.surface_radius_m)]
             active = cells_near(grid, (depth, height, width), places)
+            kept = cells_near(grid, (depth, height, width), [(bones, min(skinning.bone_radius_m, _KEPT_RADIUS_M))])
         if skinning.prior_falloff_m is not None:
             prior = BonePrior(*weight_segments(skeleton), num_bones, skinning.prior_falloff_m)
-        self.deformer = ForwardDeformer(grid, num_bones, skinning, config.search, active, prior)
+        self.deformer = ForwardDeformer(
+            grid, num_bones, skinning, config.search, active, prior, parents=skeleton.parents, field=field
+        )
+        self.register_buffer("_kept_cells", kept, persistent=False)
         self.shape = OccupancyNetwork(config.shape, 3 * (num_bones - 1), bones)
 
     def condition(self, pose: Tensor) -> Tensor:
@@ -119,6 +140,63 @@ class FastSnarf(nn.Module):
         combined = blend(logits, found, self.config.model) if blended else found.maximum(logits, NO_CORRESPONDENCE)
         done = time.perf_counter()
         return FieldSamples(combined, found.found, len(found.query), after_search - start, done - after_search)
+
+    @torch.no_grad()
+    def occupied_cells(
+        self, pose: Tensor, threshold: float = 0.0, reach_m: float = 0.0, precision: str = "highest"
+    ) -> Tensor:
+        """Return which cells the canonical shape touches in any of several poses, bool [D-1, H-1, W-1].
+
+        The shape is looked at where cells are active: elsewhere the network was never trained.
+
+        Args:
+            pose: [P, J, 3] axis-angle, radians.
+            threshold: logit above which a sample counts as occupied; samples lie 4 cm apart or closer.
+            reach_m: cells this near to an occupied sample, along each axis, are returned too, active or not.
+            precision: of the shape network.
+        """
+        deformer = self.deformer
+        size = deformer.grid.cell_size(deformer.shape)
+        finer = (size / _SAMPLES_M).ceil().long()
+        reach = (reach_m * finer / size - 1e-3).ceil().long().clamp_min(0).tolist()[::-1]
+        finer = finer.tolist()[::-1]
+        fine = deformer.active_cells
+        for axis, factor in enumerate(finer):
+            fine = fine.repeat_interleave(factor, axis)
+        left = corners_of(fine).reshape(-1).nonzero()[:, 0]  # samples that were not occupied in any pose so far
+        shape = [n + 1 for n in fine.shape]
+        places = deformer.grid.nodes(shape).reshape(-1, 3)
+        touched = torch.zeros(shape, dtype=torch.bool, device=places.device)
+        for condition in self.condition(pose):
+            values = self.canonical_logits(places[left], condition[None], torch.zeros_like(left), precision)
+            touched.view(-1)[left[values > threshold]] = True
+            left = left[values <= threshold]
+        near = touched[None, None].float()
+        for axis, count in enumerate(reach):
+            along = [count if axis == other else 0 for other in range(3)]
+            near = F.max_pool3d(near, [2 * n + 1 for n in along], 1, along)
+        return F.max_pool3d(near, [factor + 1 for factor in finer], finer)[0, 0] > 0
+
+    def refresh_cells(self, pose: Tensor, precision: str = "highest") -> None:
+        """Search from now on where the learned shape is, or could soon be; for training, every now and then.
+
+        These are all cells within 6 cm of what is occupied, or nearly, in any of the poses [P, J, 3]; so the shape can grow in
+        every direction, beyond the first region too. Cells at the bones always stay. Nothing changes if every cell is to be
+        searched (skinning.bone_radius_m is null), or while nothing is occupied.
+        """
+        cells = self.occupied_cells(pose, _GROWTH_LOGIT, _GROWTH_M, precision)
+        if self._kept_cells is not None and bool(cells.any()):
+            self.deformer.set_active_cells(cells | self._kept_cells)
+
+    def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
+        """Keep only the cells within 4 cm of what the learned shape might occupy in any of the poses [P, J, 3].
+
+        For a trained model: whatever is left out is empty in these poses, and what was never searched stays out. Nothing
+        changes if every cell is to be searched (skinning.bone_radius_m is null), or if nothing is occupied.
+        """
+        cells = self.occupied_cells(pose, _FINAL_LOGIT, _FINAL_M, precision) & self.deformer.active_cells
+        if self._kept_cells is not None and bool(cells.any()):
+            self.deformer.set_active_cells(cells)
 
     def canonical_logits(self, canonical: Tensor, condition: Tensor, pose: Tensor, precision: str = "highest") -> Tensor:
         """Return the canonical occupancy logits [M] of points [M, 3] under `condition[pose]` ([B, C] and [M])."""

@@ -60,6 +60,16 @@ class FrameBatches:
             picks.append((sequence, self.frames[index][1], np.concatenate([uniform, surface])))
         return load_frames(picks, self.device)
 
+    def poses(self, count: int, random: np.random.Generator | None = None) -> Tensor:
+        """Return the poses [P, J, 3] of `count` training frames, or all if there are fewer: random ones, or evenly spaced."""
+        count = min(count, len(self.frames))
+        if random is None:
+            chosen = np.linspace(0, len(self.frames) - 1, count).round().astype(int)
+        else:
+            chosen = random.choice(len(self.frames), count, replace=False)
+        poses = [self.sequences[self.frames[index][0]].poses[self.frames[index][1]] for index in chosen]
+        return torch.as_tensor(np.stack(poses), dtype=torch.float32, device=self.device)
+
 
 def load_frames(picks: list, device: torch.device) -> Batch:
     """Gather frames, given as tuples (sequence, frame, point indices), into one batch."""

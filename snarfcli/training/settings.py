@@ -39,6 +39,8 @@ class TrainingConfig:
     """Weight of the loss on the skinning weights at the joints."""
     joint_target: str = MISSING
     """Wanted weights at a joint: halves (own bone and parent, SNARF), parent (Fast-SNARF) or own (the released code)."""
+    refresh_cells_every: int = MISSING
+    """Steps between two looks at where the learned shape is and so which cells are searched; 0 stays with the first ones."""
     precision: str = MISSING
     """Arithmetic of the shape network: highest, high, medium or bfloat16; the search is always in full float32."""
     validate_every: int = MISSING

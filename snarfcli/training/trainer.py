@@ -26,6 +26,9 @@ __all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Trainer"]
 CHECKPOINT_FORMAT = "snarf-checkpoint"
 CHECKPOINT_VERSION = 1
 
+_POSES_OF_A_REFRESH = 4  # training poses in which the learned shape is looked at
+_POSES_AT_THE_END = 24
+
 
 class Trainer:
     """Train an avatar's networks on the samples of one subject.
@@ -60,6 +63,10 @@ class Trainer:
 
     def advance(self) -> dict[str, float]:
         """Take one step and return its losses and counts."""
+        every = self.config.refresh_cells_every
+        if every and self.step and self.step % every == 0 and self.model.deformer.search.name == "complete":
+            generator = np.random.default_rng([self.seed, self.step, 2])
+            self.model.refresh_cells(self.batches.poses(_POSES_OF_A_REFRESH, generator), self.config.precision)
         batch = self.batches.batch(self.step)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
@@ -67,6 +74,9 @@ class Trainer:
         losses = {"occupancy": occupancy_loss(field.logits, batch.occupied, field.found)}
         if self.step < self.config.bootstrap_steps:
             losses |= self._bootstrap_losses(batch.pose)
+        smoothness = self.avatar.config.skinning.smoothness
+        if smoothness > 0:
+            losses["smoothness"] = smoothness * self.model.deformer.smoothness()
         total = sum(losses.values())
         if not bool(total.isfinite()):
             raise UserError(
@@ -103,7 +113,8 @@ class Trainer:
             losses["bone_occupancy"] = self.config.bone_occupancy_weight * entropy
         if self.config.joint_weight > 0:
             weights = self.model.deformer.field(self.joints)
-            losses["joint_weight"] = self.config.joint_weight * F.mse_loss(weights, self.joint_targets)
+            if weights.requires_grad:  # given weights are not trained
+                losses["joint_weight"] = self.config.joint_weight * F.mse_loss(weights, self.joint_targets)
         return losses
 
     @torch.no_grad()
@@ -120,6 +131,12 @@ class Trainer:
             for parameter, average in zip(avatar.model.parameters(), self.average, strict=True):
                 parameter.copy_(average)
         return avatar.to(self.device)
+
+    def finished_avatar(self) -> Avatar:
+        """Return the averaged avatar, with cells to search that fit the shape that it has in the training poses."""
+        avatar = self.averaged_avatar()
+        avatar.model.tighten_cells(self.batches.poses(_POSES_AT_THE_END), self.config.precision)
+        return avatar
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:

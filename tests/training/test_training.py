@@ -49,21 +49,24 @@ def test_learns_shape_and_weights(store, tmp_path):
 
 
 def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path):
-    whole = trainer_for(store, steps=12)
+    changes = {"steps": 12, "refresh_cells_every": 5}  # the searched cells change before the interruption and after it
+    whole = trainer_for(store, **changes)
     for _ in range(12):
         whole.advance()
-    first = trainer_for(store, steps=12)
+    first = trainer_for(store, **changes)
     for _ in range(7):
         first.advance()
     torch.save(first.state(), tmp_path / "checkpoint.pt")
     torch.manual_seed(99)
-    second = Trainer(new_avatar(store), store, training_config(steps=12), 0, CPU)
+    second = Trainer(new_avatar(store), store, training_config(**changes), 0, CPU)
     second.restore(load_checkpoint(tmp_path / "checkpoint.pt", CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint"), "here")
     assert second.step == 7
     for _ in range(5):
         second.advance()
     for mine, theirs in zip(second.parameters + second.average, whole.parameters + whole.average, strict=True):
         assert torch.equal(mine, theirs)
+    cells = [trainer.model.deformer.active_cells for trainer in (second, whole)]
+    assert torch.equal(*cells)
 
 
 def test_other_settings_cannot_be_resumed(store):

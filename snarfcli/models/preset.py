@@ -1,0 +1,45 @@
+"""Skinning weights that a user brings along, from a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from snarfcli.deformer import CanonicalGrid, PresetWeights
+from snarfcli.errors import UserError
+from snarfcli.files import read_npz
+
+__all__ = ["read_preset_weights"]
+
+
+def read_preset_weights(
+    path: str | Path, grid: CanonicalGrid, shape: tuple[int, int, int], num_bones: int
+) -> PresetWeights:
+    """Read the skinning weights of a mesh and diffuse them into the grid.
+
+    Args:
+        path: .npz file with `vertices` [V, 3], metres, in the canonical pose of the subject, and `weights` [V, J].
+        grid: canonical box.
+        shape: nodes (D, H, W).
+        num_bones: J.
+
+    Raises:
+        UserError: the file is missing or damaged, an array is missing, or one does not fit.
+    """
+    arrays = read_npz(path, "weights file")
+    for name, last in (("vertices", 3), ("weights", num_bones)):
+        if name not in arrays:
+            came = ", ".join(sorted(arrays)) or "none"
+            raise UserError(f"weights file {path} must hold the arrays vertices and weights, got {came}")
+        array = arrays[name]
+        if array.ndim != 2 or array.shape[1] != last or array.dtype.kind not in "fiu":
+            raise UserError(
+                f"weights file {path}: {name} must be numbers [V, {last}], got {array.dtype} {list(array.shape)}"
+            )
+    vertices, weights = (torch.as_tensor(arrays[name].astype(np.float64)) for name in ("vertices", "weights"))
+    try:
+        return PresetWeights.from_vertices(vertices, weights, grid, shape)
+    except ValueError as error:
+        raise UserError(f"weights file {path}: {error}") from None

@@ -59,7 +59,7 @@ class CanonicalGrid:
 
     def nodes(self, shape: Sequence[int]) -> Tensor:
         """Return the canonical positions of the nodes, [D, H, W, 3], metres."""
-        axes = [torch.linspace(0, 1, n).to(self.lower) for n in shape]
+        axes = [torch.linspace(0, 1, n, dtype=self.lower.dtype, device=self.lower.device) for n in shape]
         z, y, x = torch.meshgrid(*axes, indexing="ij")
         return self.lower + torch.stack([x, y, z], -1) * (self.upper - self.lower)
 

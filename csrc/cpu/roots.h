@@ -106,9 +106,12 @@ template <class S> struct RootsOf final : snarf_roots {
   }
 };
 
+// Several starts may report one root with inverses that differ in the last bits: only identical reports compare equal.
 template <class S> bool comes_before(const Root<S>* a, const Root<S>* b) {
   if (a->order != b->order) return a->order < b->order;
-  return std::lexicographical_compare(a->canonical, a->canonical + 3, b->canonical, b->canonical + 3);
+  for (int i = 0; i < 3; ++i)
+    if (a->canonical[i] != b->canonical[i]) return a->canonical[i] < b->canonical[i];
+  return std::lexicographical_compare(a->inverse, a->inverse + 9, b->inverse, b->inverse + 9);
 }
 
 template <class S> S determinant(const S* m) {

@@ -42,7 +42,7 @@ SNARF_HD Mask solve_in_cell(const C* c, const V* offset, Mask going, const Solve
     Mask done = going & close & (longest < last_step<S>());
     Mask moves = going;
     if (k == solver.max_steps) {
-      done = going & close;
+      done = going & close & (longest < S(1e30));  // a singular Jacobian has no inverse to report
       moves = done & (longest < trusted_step<S>());
     }
     V share = S(1) / larger(longest, longest * S(0) + S(1));

@@ -11,11 +11,12 @@
 namespace snarf {
 namespace SNARF_ISA {
 
+// By all numbers of a root: several starts may report one at the same place with inverses that differ in the last bits.
 template <class S> __device__ bool comes_before(const Search<S>& a, int one, int other) {
   if (a.root_order[one] != a.root_order[other]) return a.root_order[one] < a.root_order[other];
   const S* p = a.root + 12 * (long long)one;
   const S* q = a.root + 12 * (long long)other;
-  for (int i = 0; i < 3; ++i)
+  for (int i = 0; i < 12; ++i)
     if (p[i] != q[i]) return p[i] < q[i];
   return false;
 }

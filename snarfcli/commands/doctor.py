@@ -135,29 +135,10 @@ def _gpu() -> Iterator[Finding]:
         device = torch.cuda.get_device_properties(index)
         memory = f"{device.total_memory / 2**30:.1f} GiB"
         yield Finding(f"cuda:{index}", f"{device.name}, {memory}, compute capability {device.major}.{device.minor}")
-    yield _nvrtc(needed=count > 0)
-    try:
-        status = importlib.import_module("snarfcli.deformer.cuda").cuda_status()
-    except ModuleNotFoundError as error:
-        if error.name != "snarfcli.deformer.cuda":
-            raise
-        status = "none in this version"
-    yield Finding("CUDA kernels", status)
+    from snarfcli.deformer.cuda import cuda_status
 
-
-def _nvrtc(needed: bool) -> Finding:
-    """Return the version of the compiler of CUDA kernels; without a GPU its absence is no lack."""
-    try:
-        nvrtc = importlib.import_module("cuda.bindings.nvrtc")
-        error, major, minor = nvrtc.nvrtcVersion()
-        if int(error) != 0:
-            raise RuntimeError(f"nvrtcVersion gave error {int(error)}")
-    except ModuleNotFoundError:
-        advice = '; run "pip install cuda-bindings"' if needed else ", not needed without a GPU"
-        return Finding("NVRTC", f"no cuda.bindings{advice}", is_fallback=needed)
-    except Exception as error:
-        return Finding("NVRTC", f"cannot be used: {_one_line(error)}", is_fallback=needed)
-    return Finding("NVRTC", f"{major}.{minor}, cuda-bindings {version('cuda-bindings')}")
+    status = cuda_status()
+    yield Finding("CUDA kernels", status, is_fallback=count > 0 and status.startswith("not available"))
 
 
 def _tools() -> Iterator[Finding]:

@@ -60,8 +60,8 @@ def test_the_wheel_holds_what_is_needed_at_run_time(wheel, tmp_path):
     assert re.fullmatch(r"snarf-[\d.]+-py3-none-(?!any)\w+\.whl", wheel.name)
     names = set(unpack(wheel, tmp_path))
     configuration = {f"snarfcli/conf/{path.relative_to(ROOT / 'conf').as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
-    sources = {f"snarfcli/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "csrc/include/snarf").glob("*.h")}
-    sources |= {f"snarfcli/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "csrc/cuda").glob("*.cu")}
+    kernels = [path for folder in ("include/snarf", "cuda") for path in (ROOT / "csrc" / folder).iterdir()]
+    sources = {f"snarfcli/{path.relative_to(ROOT).as_posix()}" for path in kernels}
     modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "snarfcli").rglob("*.py")}
     assert configuration and sources
     assert configuration | sources | modules | {"snarfcli/bodies/body_cc0.npz"} <= names

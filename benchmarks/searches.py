@@ -59,7 +59,7 @@ def methods(names: str | None = None) -> list[Method]:
 
 def _ours(backend: str, search: str = "complete", nine: bool = False) -> Callable:
     def run(points: Tensor, transforms: Tensor, scene: Scene, active: Tensor | None = None):
-        settings = {"active_cells": active}
+        settings = {"active_cells": active if search == "complete" else None}
         if search == "broyden":
             settings = {name: value / scene.grid.longest_side for name, value in _BROYDEN_M.items()}
             settings["init_bones"] = scene.init_bones if nine else None

@@ -53,6 +53,7 @@ def check_search(search: SearchConfig) -> None:
     """
     check_choice("search.name", search.name, _SEARCHES)
     check_choice("search.jacobian", search.jacobian, _JACOBIANS)
+    check_choice("search.backend", search.backend, ("auto", "native", "reference"))
     if search.name == "complete" and search.init_bones is not None:
         raise UserError("search.init_bones is for search=broyden; the complete search has no start bones")
     if search.name == "complete" and search.jacobian != "exact":

@@ -42,7 +42,7 @@ template <class S> class Blending {
     task_.nodes = int64_t(blending.nodes[0]) * blending.nodes[1] * blending.nodes[2];
     task_.columns = (blending.count + kRow - 1) / kRow * kRow;
     bones_ = static_cast<const S*>(blending.bones);
-    threads_ = int(std::max<int64_t>(1, std::min<int64_t>(blending.threads, task_.nodes * task_.poses / kQueriesPerThread)));
+    threads_ = int(std::max<int64_t>(1, std::min<int64_t>(blending.threads, task_.nodes * task_.poses / kWorkPerThread)));
   }
 
   void forward(S* transforms) {
@@ -67,6 +67,7 @@ template <class S> class Blending {
 
   void bones(const S* gradient, S* v_bones) {
     const int64_t rows = task_.poses * task_.bones;
+    if (!rows) return;
     std::vector<S> sums(size_t(kNodeChunks * rows * kRow), S(0));
     each_chunk([&](const BlendTask<S>& task, int64_t chunk) {
       kernels<S>().blend_bones(task, gradient, &sums[size_t(chunk * rows * kRow)]);

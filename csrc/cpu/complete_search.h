@@ -27,6 +27,7 @@ namespace snarf {
 
 constexpr int64_t kGroupQueries = int64_t(1) << 20;  // queries searched together: bounds the memory of the sort
 constexpr int64_t kGroupBlocks = int64_t(1) << 17;   // blocks of cells of all poses searched together: 50 MB of boxes
+constexpr int64_t kMostChunks = 8;                    // parts of a pose's queries that are sorted at once; each has a histogram
 constexpr double kBinPerBox = 0.6;                  // side of a bin, in mean sides of the posed boxes
 
 template <class S> class ScratchLists {
@@ -83,7 +84,7 @@ template <class S> S smallest_side(const Geometry<S>& geometry) {
   return std::min(geometry.size[0], std::min(geometry.size[1], geometry.size[2]));
 }
 
-// A box and what its phases gather, one for each pose and thread.
+// A box, and how large the boxes in it are; one for each pose and thread, or part of its queries.
 template <class S> struct Extent {
   S lower[3], upper[3];
   double sides = 0;
@@ -108,7 +109,7 @@ template <class S> class CompleteSearch {
   CompleteSearch(const snarf_field& field, const snarf_queries& queries, const snarf_complete& settings, const std::vector<Block>& blocks,
                  int64_t first_pose, int64_t poses, int64_t first_query, int64_t count, int threads)
       : kernels_(kernels<S>()), blocks_(blocks), poses_(poses), count_(count), threads_(threads),
-        chunks_(int((threads + poses - 1) / poses)), geometry_(geometry_of<S>(field)), nodes_(node_count(field)),
+        chunks_(int(std::min<int64_t>((threads + poses - 1) / poses, kMostChunks))), geometry_(geometry_of<S>(field)), nodes_(node_count(field)),
         points_(static_cast<const S*>(queries.points) + 3 * (first_pose * queries.count + first_query)), stride_(3 * queries.count),
         transforms_(static_cast<const S*>(field.transforms) + 12 * nodes_ * first_pose), settings_(settings),
         box_queue_(poses * int64_t(blocks.size()), 16), extent_queue_(poses * chunks_, 1), mark_queue_(poses * int64_t(blocks.size()), 16),
@@ -148,7 +149,7 @@ template <class S> class CompleteSearch {
     for (int64_t first, last; box_queue_.take(first, last);)
       for (int64_t n = first; n < last; ++n) {
         const int64_t pose = n / int64_t(blocks_.size());
-        kernels_.boxes(transforms_ + 12 * nodes_ * pose, geometry_, &blocks_[n % blocks_.size()], 1, &boxes_[n]);
+        kernels_.boxes(transforms_ + 12 * nodes_ * pose, geometry_, blocks_[n % blocks_.size()], boxes_[n]);
         Extent<S>& extent = box_extents_[thread * poses_ + pose];
         for (int k = 0; k < kBlock; ++k) {
           if (!(boxes_[n].lower[0][k] <= boxes_[n].upper[0][k])) continue;
@@ -194,7 +195,7 @@ template <class S> class CompleteSearch {
         for (;; side *= 1.25) {
           volume = 1;
           for (int i = 0; i < 3; ++i) volume *= std::floor(double(sorted.upper[i] - sorted.lower[i]) / std::max(side, 1e-30)) + 1;
-          if (volume <= double(2 * count_ + 4096)) break;
+          if (volume <= double(count_ + 4096)) break;
         }
       }
       sorted.per_metre = S(1 / std::max(side, 1e-30));
@@ -366,7 +367,7 @@ template <class S> class CompleteSearch {
 };
 
 inline int threads_for(const snarf_queries& queries, int64_t count) {
-  return int(std::max<int64_t>(1, std::min<int64_t>(queries.threads, count / kQueriesPerThread)));
+  return int(std::max<int64_t>(1, std::min<int64_t>(queries.threads, count / kWorkPerThread)));
 }
 
 template <class S>

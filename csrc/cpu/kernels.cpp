@@ -19,7 +19,6 @@ namespace {
 
 // The polynomials of as many cells as there are lanes, laid out so that one cell's numbers can be picked out.
 template <class S> struct CellLanes {
-  static constexpr int width = Lanes<S>::width;
   Cell<Lanes<S>> cell;
   CellBounds<Lanes<S>> bounds;
 };
@@ -138,32 +137,29 @@ template <class S> void bins(const SortedQueries<S>& queries, const S* points, i
   }
 }
 
-template <class S> void boxes(const S* transforms, const Geometry<S>& geometry, const Block* blocks, int64_t count, BlockBoxes<S>* out) {
+template <class S> void boxes(const S* transforms, const Geometry<S>& geometry, const Block& block, BlockBoxes<S>& out) {
   using V = Lanes<S>;
   constexpr int width = V::width;
-  for (int64_t n = 0; n < count; ++n) {
-    const Block& block = blocks[n];
-    for (int first = 0; first < kBlock; first += width) {
-      const uint32_t active = block.active >> first & ((1u << width) - 1);
-      for (int i = 0; i < 3; ++i)
-        for (int k = first; k < first + width; ++k) {
-          out[n].lower[i][k] = S(1);
-          out[n].upper[i][k] = S(-1);
-        }
-      if (!active) continue;
-      Cell<V> cells;
-      V box[3];
-      load_cells(transforms, geometry, block.x + first, block.y, block.z, cells);
-      bound_box<V, S>(cells, box);
-      for (int i = 0; i < 3; ++i)
-        for (int k = 0; k < width; ++k) {
-          const S centre = cells.c[kMonomials * i][k], extent = box[i][k];
-          const bool usable = extent < S(1e15) && centre - centre == 0;  // non-finite or absurd transforms give no root
-          if (!(active >> k & 1) || !usable) continue;
-          out[n].lower[i][first + k] = centre - extent;
-          out[n].upper[i][first + k] = centre + extent;
-        }
-    }
+  for (int first = 0; first < kBlock; first += width) {
+    const uint32_t active = block.active >> first & ((1u << width) - 1);
+    for (int i = 0; i < 3; ++i)
+      for (int k = first; k < first + width; ++k) {
+        out.lower[i][k] = S(1);
+        out.upper[i][k] = S(-1);
+      }
+    if (!active) continue;
+    Cell<V> cells;
+    V box[3];
+    load_cells(transforms, geometry, block.x + first, block.y, block.z, cells);
+    bound_box<V, S>(cells, box);
+    for (int i = 0; i < 3; ++i)
+      for (int k = 0; k < width; ++k) {
+        const S centre = cells.c[kMonomials * i][k], extent = box[i][k];
+        const bool usable = extent < S(1e15) && centre - centre == 0;  // non-finite or absurd transforms give no root
+        if (!(active >> k & 1) || !usable) continue;
+        out.lower[i][first + k] = centre - extent;
+        out.upper[i][first + k] = centre + extent;
+      }
   }
 }
 
@@ -273,7 +269,7 @@ template <class S> void search_part(Search<S>& search, const Part<S>& part, int6
     Cell<V> whole;
     for (int m = 0; m < 3 * kMonomials; ++m) whole.c[m] = V(part.c[m]);
     halve_cell<V, S>(whole, shift, parts.cell);
-    bound_cell<V, S>(parts.cell, parts.bounds);
+    bound_cell<V, S>(parts.cell, parts.bounds, S(0.5) + face_tolerance<S>() * S(2) / part.scale);
     // Which eighths may hold a root of a candidate, one lane an eighth.
     uint32_t some = 0;
     for (int64_t i = 0; i < count; ++i) {
@@ -368,7 +364,7 @@ void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>
   }
 }
 
-template <class S> void broyden_queries(const BroydenTask<S>& task, int64_t first, int64_t last, int32_t query_offset, RootSink<S>& sink) {
+template <class S> void broyden_queries(const BroydenTask<S>& task, int64_t first, int64_t last, RootSink<S>& sink) {
   const Grid<S> grid = grid_of(task.geometry);
   const Broyden<S> settings{task.tolerance, task.divergence, task.max_steps, task.exact_jacobian};
   for (int64_t n = first; n < last; ++n) {
@@ -396,7 +392,7 @@ template <class S> void broyden_queries(const BroydenTask<S>& task, int64_t firs
       }
       if (sink.next == sink.end) sink.more(&sink);
       Root<S>& root = *sink.next++;
-      root.query = int32_t(n) + query_offset;
+      root.query = int32_t(n);
       root.order = int32_t(start);
       for (int i = 0; i < 3; ++i) root.canonical[i] = x[i];
       for (int i = 0; i < 9; ++i) root.inverse[i] = inverse[i];

@@ -111,12 +111,12 @@ template <class S> struct Kernels {
   void (*extent)(const S* points, int64_t count, S* lower, S* upper);
   // Which bin each of `count` points [N, 3] lies in; -1 outside of the bins' region.
   void (*bins)(const SortedQueries<S>&, const S* points, int64_t count, int32_t* bin);
-  // Fills the boxes of `count` blocks.
-  void (*boxes)(const S* transforms, const Geometry<S>&, const Block*, int64_t count, BlockBoxes<S>*);
+  // Bounds where a block's cells go.
+  void (*boxes)(const S* transforms, const Geometry<S>&, const Block&, BlockBoxes<S>&);
   // Finds the roots in one block's cells.
   void (*search)(const CompleteTask<S>&, const Block&, const BlockBoxes<S>&, Scratch<S>&, RootSink<S>&);
   // Runs Broyden's method for the queries first to last.
-  void (*broyden)(const BroydenTask<S>&, int64_t first, int64_t last, int32_t query_offset, RootSink<S>&);
+  void (*broyden)(const BroydenTask<S>&, int64_t first, int64_t last, RootSink<S>&);
   void (*backward)(const BackwardTask<S>&);
 };
 

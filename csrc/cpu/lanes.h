@@ -8,7 +8,7 @@
 
 #include "snarf/platform.h"
 
-#if defined(__AVX512F__) || defined(__AVX2__)
+#if defined(__GNUC__) && (defined(__AVX512F__) || defined(__AVX2__))
 #include <immintrin.h>
 #endif
 
@@ -217,10 +217,10 @@ SNARF_HD void load_rows(const float* const* row, Lanes<float>* out) {
 
 // One bit per lane, lane 0 lowest.
 template <class S> SNARF_HD uint32_t bits(LaneMask<S> mask) {
-#if defined(__AVX512DQ__)
+#if defined(__GNUC__) && defined(__AVX512DQ__)
   if (sizeof(S) == 4) return (uint32_t)_mm512_movepi32_mask((__m512i)mask.v);
   return (uint32_t)_mm512_movepi64_mask((__m512i)mask.v);
-#elif defined(__AVX2__)
+#elif defined(__GNUC__) && defined(__AVX2__)
   if (sizeof(S) == 4) return (uint32_t)_mm256_movemask_ps((__m256)mask.v);
   return (uint32_t)_mm256_movemask_pd((__m256d)mask.v);
 #else

@@ -44,7 +44,7 @@ void broyden_search(const snarf_field& field, const snarf_queries& queries, cons
       phases.push_back([&](int thread) {
         group->lists[thread].reset(new RootList<S>());
         for (int64_t first, last; queue.take(first, last);)
-          kernels<S>().broyden(task, first, last, 0, group->lists[thread]->sink());
+          kernels<S>().broyden(task, first, last, group->lists[thread]->sink());
       });
       collect.add_to(phases);
       if (!run_phases(threads, phases)) throw std::bad_alloc();
@@ -58,7 +58,7 @@ void implicit_backward(const snarf_field& field, const snarf_queries& queries, i
   const int64_t nodes = node_count(field), layers = field.nodes[2];
   if (v_points) std::fill(v_points, v_points + 3 * queries.poses * queries.count, S(0));
   if (v_transforms) std::fill(v_transforms, v_transforms + 12 * queries.poses * nodes, S(0));
-  if (!roots) return;
+  if (!roots || !queries.poses || !queries.count) return;
   const int threads = threads_for(queries, roots);
   // Poses write to nodes of their own; those of a pose are cut into layers, whose owners pass over the same roots in the same order.
   const int64_t slabs = std::min<int64_t>(layers, (threads + queries.poses - 1) / queries.poses);

@@ -19,7 +19,7 @@ struct snarf_roots {
 
 namespace snarf {
 
-constexpr int64_t kQueriesPerThread = 2048;  // less is not worth starting a thread for
+constexpr int64_t kWorkPerThread = 2048;  // queries, roots or nodes; less is not worth starting a thread for
 
 // The roots that one thread found, in blocks that never move.
 template <class S> class RootList {
@@ -87,7 +87,7 @@ template <class S> struct RootsOf final : snarf_roots {
       int64_t* const q = query + done;
       const Group<S>& from = *group;
       Queue queue(from.count, 4096);
-      const bool well = run_phases(from.count > 4 * kQueriesPerThread ? threads : 1, {[&](int) {
+      const bool well = run_phases(from.count > 4 * kWorkPerThread ? threads : 1, {[&](int) {
         for (int64_t first, last; queue.take(first, last);)
           for (int64_t m = first; m < last; ++m) {
             prefetch(from.sorted[std::min(m + kAhead, last - 1)]);
@@ -149,7 +149,6 @@ template <class S> class Collect {
         total += here;
       }
       group_.sorted.reset(new const Root<S>*[total]);
-      total_ = total;
       kept_.assign(threads_, 0);
     });
     phases.push_back([this](int) {  // begin_[q] becomes the end of q, which is where q + 1 begins
@@ -199,7 +198,6 @@ template <class S> class Collect {
   std::vector<int64_t> kept_;
   Queue counting_, placing_;
   const int threads_;
-  int64_t total_ = 0;
 };
 
 }  // namespace snarf

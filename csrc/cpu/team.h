@@ -1,6 +1,7 @@
 // Threads that work through the phases of one call together.
 //
-// They live for one call only: nothing spins between calls beside the caller's own threads, and a forked process starts clean.
+// They live for one call only: between calls none of them takes time from the caller's own threads, and a forked process has none
+// to miss.
 #pragma once
 
 #include <atomic>
@@ -65,13 +66,13 @@ inline bool run_phases(int threads, const std::vector<std::function<void(int)>>&
   Barrier barrier(threads);
   const auto work = [&](int first, int last) {  // does the work of these threads
     for (const auto& phase : phases) {
+      // After a failure the threads still meet at every barrier: who left early would be waited for.
       try {
-        for (int thread = first; thread < last; ++thread) phase(thread);
+        for (int thread = first; thread < last && !failed; ++thread) phase(thread);
       } catch (...) {
         failed = true;
       }
       barrier.wait(last - first);
-      if (failed) return;
     }
   };
   std::vector<std::thread> helpers;

@@ -266,11 +266,12 @@ template <class S> __device__ void eighth(int k, S* shift) {
   for (int i = 0; i < 3; ++i) shift[i] = k >> i & 1 ? S(0.25) : S(-0.25);
 }
 
-template <class S> __device__ void halve(const Cell<S>& whole, int k, Record<S>& part) {
+// `level` is that of the part: a root may lie as far beyond its faces as beyond those of the cell.
+template <class S> __device__ void halve(const Cell<S>& whole, int k, int level, Record<S>& part) {
   S shift[3];
   eighth(k, shift);
   halve_cell<S, S>(whole, shift, part.cell);
-  bound_cell<S, S>(part.cell, part.bounds);
+  bound_cell<S, S>(part.cell, part.bounds, S(0.5) + face_tolerance<S>() * S(1 << level));
 }
 
 // The roots in eighth k of a cell, of which `first` is the record: depth first through its parts, down to tame ones or to the
@@ -315,8 +316,8 @@ __device__ void solve_curved(const Search<S>& a, const Grid<S>& grid, const Pair
       if (deepest == 0) return;
       S shift[3];
       eighth(following[deepest], shift);
-      halve(split[deepest], following[deepest]++, part);
       level = deepest + 1;
+      halve(split[deepest], following[deepest]++, level, part);
       for (int i = 0; i < 3; ++i) centre[level][i] = centre[deepest][i] + shift[i] / S(1 << deepest);
     } while (!holds(part, pair.target));
   }
@@ -373,7 +374,7 @@ __device__ __forceinline__ void search_chunk(const Search<S>& a, const Grid<S>& 
   if (t == 0) queued = 0;
   if (item < items) {
     item_cell[t] = kCurved ? list[a.cells - 1 - item / 8] : list[item];
-    if (kCurved) halve(records[item_cell[t]].cell, int(item % 8), parts[t]);
+    if (kCurved) halve(records[item_cell[t]].cell, int(item % 8), 1, parts[t]);
     const Record<S>& record = kCurved ? parts[t] : records[item_cell[t]];
     int low[3], high[3];
     bool touched = true;

@@ -16,8 +16,8 @@ __all__ = ["blend", "blend_backward", "refuse_second_derivative"]
 def blend(weights: Tensor, bones: Tensor, active_cells: Tensor | None, backend: str) -> Tensor:
     """Blend bone transforms [B, J, 12] with the weights [D, H, W, J] of the grid's nodes to [B, D * H * W, 12].
 
-    In full precision, forward and backward, whatever precision the caller allows for his matrix products: TF32 would move a
-    point by half a millimetre at one metre.
+    In full precision, forward and backward, whatever precision the caller allows for matrix products: TF32 would move a point
+    by half a millimetre at one metre.
 
     Args:
         active_cells: bool [D-1, H-1, W-1]; nodes that are no corner of an active cell need not be blended and get zeros, or
@@ -28,7 +28,7 @@ def blend(weights: Tensor, bones: Tensor, active_cells: Tensor | None, backend: 
     """
     if not weights.is_cuda and choose_backend(backend) == "native":
         return native.blend(weights, bones, active_cells)
-    with matmul_precision("highest"):
+    with matmul_precision("highest"), torch.autocast(weights.device.type, enabled=False):
         return torch.matmul(weights.reshape(1, -1, weights.shape[-1]), bones)
 
 
@@ -50,7 +50,7 @@ def blend_backward(
         return native.blend_backward(gradient, weights, bones, active_cells, (wants_weights, wants_bones))
     flat = weights.reshape(-1, weights.shape[-1])
     v_weights, v_bones = weights.new_empty(0), bones.new_empty(0)
-    with matmul_precision("highest"):
+    with matmul_precision("highest"), torch.autocast(weights.device.type, enabled=False):
         if wants_weights:
             v_flat = torch.zeros_like(flat, memory_format=torch.contiguous_format)
             for one, pose in zip(gradient, bones, strict=True):

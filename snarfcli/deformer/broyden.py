@@ -30,7 +30,7 @@ def broyden_roots(
     """Find canonical correspondences from the start points B_i^-1 x'.
 
     Differs from the released code in three places: the start Jacobian is exact, a step outside the grid is clamped to its
-    border (there: zero transforms), and J^-1 at the root is exact unless `jacobian="broyden"`.
+    border (there: zero transforms), and J^-1 at the root is exact if asked for.
 
     Args:
         points: queries [B, N, 3], posed space, metres. Non-finite ones have no root.
@@ -116,4 +116,6 @@ def _iterate(
     x, query, inverse = (torch.cat(parts) for parts in zip(*found, strict=True))
     if exact_jacobian and len(x):
         inverse = invert_3x3(evaluate(x)[1])[0]
-    return Roots(x, query, inverse)
+    roots = Roots(x, query, inverse)
+    # Where the Jacobian is singular there is no inverse to report.
+    return roots.take(inverse.isfinite().flatten(1).all(1).nonzero()[:, 0])

@@ -225,7 +225,8 @@ def _newton(
         inverse, _ = invert_3x3(jacobian)
         step = torch.bmm(inverse, residual[:, :, None])[:, :, 0]
         longest = step.abs().amax(1, keepdim=True)
-        converged = residual.norm(dim=1) < tolerance
+        # Where the Jacobian is singular there is no inverse to report.
+        converged = (residual.norm(dim=1) < tolerance) & longest[:, 0].isfinite()
         # A last, tiny step polishes a converged root; beside a fold, where it is not tiny, the point stays where it is.
         trusted = (~converged)[:, None] | (longest < _POLISH)
         local = torch.where(trusted, local - step / longest.clamp_min(1), local)

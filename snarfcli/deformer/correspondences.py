@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.ops import broyden_search, complete_search
 from snarfcli.deformer.search import invert_3x3
 from snarfcli.deformer.skinning import blend_transforms
 
-__all__ = ["Correspondences", "find_correspondences"]
+__all__ = ["Correspondences", "check_transforms", "find_correspondences"]
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class Correspondences:
         Source: SNARF Eq. 9.
         """
         out = values.new_full((self.batch * self.count + 1,), empty)
-        return out.scatter_reduce(0, self.query, values, "amax")[:-1].reshape(self.batch, self.count)
+        return out.scatter_reduce(0, self.query, values, "amax", include_self=False)[:-1].reshape(self.batch, self.count)
 
 
 def find_correspondences(
@@ -122,13 +123,18 @@ def find_correspondences(
 
     Source: SNARF Sec. 3.2 and 3.4 (Eq. 5-9, 14); Fast-SNARF Sec. 4.
     """
-    _check_shapes(points, bone_transforms, skinning_weights, search, init_bones, active_cells, jacobian, backend, capacity)
-    if check:
-        _check_values(bone_transforms, skinning_weights)
+    _check_shapes(points, bone_transforms, skinning_weights, active_cells)
+    _check_settings(search, init_bones, active_cells, jacobian, backend, bone_transforms.shape[1])
+    for name, value in (("tolerance", tolerance), ("max_steps", max_steps), ("divergence", divergence)):
+        if not value > 0:
+            raise ValueError(f"{name} must be greater than 0, got {value}")
+    if capacity is not None and capacity < 0:
+        raise ValueError(f"capacity must be 0 or more, got {capacity}")
     grid = grid.to(points)
+    if check:
+        _check_values(grid, bone_transforms, skinning_weights, active_cells)
     depth, height, width = skinning_weights.shape[:3]
-    searched = active_cells if search == "complete" else None
-    transforms = blend_transforms(skinning_weights, bone_transforms, searched, backend)
+    transforms = blend_transforms(skinning_weights, bone_transforms, active_cells, backend)
     box = (grid.lower, grid.upper, [depth, height, width])
     common = (orientation_preserving, capacity, backend)
     if search == "complete":
@@ -150,38 +156,49 @@ def _start_transforms(bone_transforms: Tensor, init_bones: Sequence[int] | None)
     return torch.cat([turn, shift[..., None]], -1).reshape(*chosen.shape[:2], 12)
 
 
-def _check_values(bone_transforms: Tensor, skinning_weights: Tensor) -> None:
-    """Refuse transforms that cannot be inverted and weights that are none; on a GPU this is not looked at."""
+@torch.no_grad()
+def check_transforms(bone_transforms: Tensor) -> None:
+    """Refuse transforms [B, J, 4, 4] that cannot be inverted; on a GPU, which would be waited for, nothing is looked at.
+
+    Raises:
+        ValueError: one is not finite or singular.
+    """
     if bone_transforms.is_cuda or torch.compiler.is_compiling():
         return
+    if not bool(bone_transforms.isfinite().all()):
+        raise ValueError("bone_transforms must be finite, got NaN or infinite values")
+    turn = bone_transforms[..., :3, :3].reshape(-1, 3, 3)
+    _, determinant = invert_3x3(turn)
+    singular = (determinant.abs() <= 1e-9 * turn.abs().amax((1, 2)) ** 3).nonzero()[:, 0]
+    if len(singular):
+        pose, bone = divmod(int(singular[0]), bone_transforms.shape[1])
+        raise ValueError(f"bone_transforms must be invertible, got a singular one for bone {bone} of pose {pose}")
+
+
+def _check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
+    """Refuse a box, transforms or weights that are none; on a GPU, which would be waited for, nothing is looked at."""
+    if bone_transforms.is_cuda or torch.compiler.is_compiling():
+        return
+    if not bool((grid.upper > grid.lower).all()):
+        box = f"{grid.lower.tolist()} and {grid.upper.tolist()}"
+        raise ValueError(f"grid.upper must exceed grid.lower in {grid.lower.dtype}, got {box}")
+    check_transforms(bone_transforms)
     with torch.no_grad():
-        turn = bone_transforms[..., :3, :3].reshape(-1, 3, 3)
-        if not bool(bone_transforms.isfinite().all()):
-            raise ValueError("bone_transforms must be finite, got NaN or infinite values")
-        _, determinant = invert_3x3(turn)
-        singular = (determinant.abs() <= 1e-9 * turn.abs().amax((1, 2)) ** 3).nonzero()[:, 0]
-        if len(singular):
-            pose, bone = divmod(int(singular[0]), bone_transforms.shape[1])
-            raise ValueError(f"bone_transforms must be invertible, got a singular one for bone {bone} of pose {pose}")
-        total = skinning_weights.sum(-1)
-        wrong = ~((total - 1).abs() < 1e-3) & (total != 0)
+        wrong = ~((skinning_weights.sum(-1) - 1).abs() < 1e-3)
+        if active_cells is not None:
+            wrong &= corners_of(active_cells)
         if bool(wrong.any()):
-            came = float(total[wrong][0])
-            raise ValueError(
-                f"skinning_weights must sum to 1 at every node (or be all 0 where no cell is searched), got a sum of {came:.4g}"
-            )
+            came = float(skinning_weights[wrong][0].sum())
+            raise ValueError(f"skinning_weights must sum to 1 at every node of a searched cell, got a sum of {came:.4g}")
 
 
-def _check_shapes(
-    points, bone_transforms, skinning_weights, search, init_bones, active_cells, jacobian, backend, capacity
-) -> None:
-    """Refuse arguments that do not fit together."""
+def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
+    """Refuse tensors that do not fit together."""
     if points.ndim != 3 or points.shape[2] != 3:
         raise ValueError(f"points must have shape [B, N, 3], got {list(points.shape)}")
-    if skinning_weights.ndim != 4 or min(skinning_weights.shape[:3]) < 2:
+    if skinning_weights.ndim != 4 or min(skinning_weights.shape[:3]) < 2 or skinning_weights.shape[3] < 1:
         raise ValueError(f"skinning_weights must be [D, H, W, J], two nodes or more a side, got {list(skinning_weights.shape)}")
-    bones = skinning_weights.shape[3]
-    wanted = [points.shape[0], bones, 4, 4]
+    wanted = [points.shape[0], skinning_weights.shape[3], 4, 4]
     if list(bone_transforms.shape) != wanted:
         raise ValueError(f"bone_transforms must have shape {wanted} to fit the others, got {list(bone_transforms.shape)}")
     for name, tensor in (("points", points), ("bone_transforms", bone_transforms), ("skinning_weights", skinning_weights)):
@@ -191,22 +208,34 @@ def _check_shapes(
             raise TypeError(f"{name} must have the dtype of points, {points.dtype}, got {tensor.dtype}")
         if tensor.device != points.device:
             raise ValueError(f"{name} must be on the device of points, {points.device}, got {tensor.device}")
-    if search not in ("complete", "broyden"):
-        raise ValueError(f"search must be 'complete' or 'broyden', got {search!r}")
-    if jacobian not in ("exact", "broyden"):
-        raise ValueError(f"jacobian must be 'exact' or 'broyden', got {jacobian!r}")
+    if active_cells is None:
+        return
+    cells = [n - 1 for n in skinning_weights.shape[:3]]
+    if list(active_cells.shape) != cells or active_cells.dtype != torch.bool:
+        raise ValueError(f"active_cells must be bool {cells}, got {active_cells.dtype} {list(active_cells.shape)}")
+    if active_cells.device != points.device:
+        raise ValueError(f"active_cells must be on the device of points, {points.device}, got {active_cells.device}")
+
+
+def _check_settings(
+    search: str, init_bones: Sequence[int] | None, active_cells: Tensor | None, jacobian: str, backend: str, bones: int
+) -> None:
+    """Refuse names and settings that mean nothing, or nothing to this search."""
+    choices = {
+        "search": (search, ("complete", "broyden")),
+        "jacobian": (jacobian, ("exact", "broyden")),
+        "backend": (backend, ("auto", "native", "reference")),
+    }
+    for name, (value, known) in choices.items():
+        if value not in known:
+            raise ValueError(f"{name} must be {', '.join(map(repr, known[:-1]))} or {known[-1]!r}, got {value!r}")
     if search == "complete" and jacobian == "broyden":
         raise ValueError("jacobian='broyden' needs search='broyden': a complete search has the exact one at hand")
+    if search == "complete" and init_bones is not None:
+        raise ValueError("init_bones needs search='broyden': a complete search has no starts")
+    if search == "broyden" and active_cells is not None:
+        raise ValueError("active_cells needs search='complete': broyden goes wherever its steps lead")
     if init_bones is not None and not all(0 <= bone < bones for bone in init_bones):
         raise ValueError(f"init_bones must lie in 0..{bones - 1}, got {list(init_bones)}")
     if init_bones is not None and not len(init_bones):
         raise ValueError("init_bones must name at least one bone, got none; None means all bones")
-    cells = [n - 1 for n in skinning_weights.shape[:3]]
-    if active_cells is not None and (list(active_cells.shape) != cells or active_cells.dtype != torch.bool):
-        raise ValueError(f"active_cells must be bool {cells}, got {active_cells.dtype} {list(active_cells.shape)}")
-    if active_cells is not None and active_cells.device != points.device:
-        raise ValueError(f"active_cells must be on the device of points, {points.device}, got {active_cells.device}")
-    if backend not in ("auto", "native", "reference"):
-        raise ValueError(f"backend must be 'auto', 'native' or 'reference', got {backend!r}")
-    if capacity is not None and capacity < 0:
-        raise ValueError(f"capacity must be 0 or more, got {capacity}")

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.complete import posed_cell_boxes
-from snarfcli.deformer.correspondences import Correspondences, find_correspondences
+from snarfcli.deformer.correspondences import Correspondences, check_transforms, find_correspondences
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
 from snarfcli.deformer.hierarchy import make_softmax
@@ -121,7 +121,7 @@ class ForwardDeformer(nn.Module):
     @property
     def grid(self) -> CanonicalGrid:
         """The box of the weight grid."""
-        return CanonicalGrid(self.lower, self.upper)
+        return CanonicalGrid(self.lower, self.upper, checked=True)
 
     def weight_grid(self, active_only: bool = False) -> Tensor:
         """Return the skinning weights at the grid nodes, [D, H, W, J].
@@ -163,17 +163,38 @@ class ForwardDeformer(nn.Module):
         self._frozen = None
         return super()._apply(fn, recurse)
 
-    def forward(self, points: Tensor, bone_transforms: Tensor) -> Correspondences:
-        """Find the correspondences of posed points [B, N, 3] under bone transforms [B, J, 4, 4], canonical to posed."""
+    def forward(self, points: Tensor, bone_transforms: Tensor, capacity: int | None = None) -> Correspondences:
+        """Find the correspondences of posed points [B, N, 3] under bone transforms [B, J, 4, 4], canonical to posed.
+
+        In full precision, also under autocast. `capacity` is that of `find_correspondences`; a field that is searched directly
+        takes none.
+        """
+        with torch.autocast(points.device.type, enabled=False):
+            return self._forward(points, bone_transforms, capacity)
+
+    def _forward(self, points: Tensor, bone_transforms: Tensor, capacity: int | None) -> Correspondences:
         options = asdict(self.search)
         name = options.pop("name")
         if not self.searches_field:
             complete = name == "complete"
             active = self.active_cells if complete else None
             weights = self.weight_grid(active_only=complete)
+            own = isinstance(self.field, WeightField)  # its weights sum to one
+            if own:
+                check_transforms(bone_transforms)
             return find_correspondences(
-                points, bone_transforms, weights, self.grid, search=name, active_cells=active, **options
+                points,
+                bone_transforms,
+                weights,
+                self.grid,
+                search=name,
+                active_cells=active,
+                capacity=capacity,
+                check=not own,
+                **options,
             )
+        if capacity is not None:
+            raise ValueError("capacity needs a search on the grid; a field that is searched directly takes none")
         length = self.grid.longest_side
         return find_correspondences_on_field(
             points,
@@ -185,7 +206,7 @@ class ForwardDeformer(nn.Module):
             max_steps=options["max_steps"],
             divergence=options["divergence"] * length,
             jacobian=options["jacobian"],
-            orientation_preserving=options.get("orientation_preserving", False),
+            orientation_preserving=options["orientation_preserving"],
         )
 
     def set_active_cells(self, cells: Tensor) -> None:

@@ -227,14 +227,15 @@ def _search(function: str, field: _Field, points: Tensor, settings: Structure) -
     queries = _Queries(points.data_ptr(), points.shape[0], points.shape[1], torch.get_num_threads())
     handle, found = c_void_p(), c_int64()
     _raise_for(getattr(library, function)(byref(field), byref(queries), byref(settings), byref(handle), byref(found)))
-    canonical = points.new_empty(found.value, 3)
-    inverse = points.new_empty(found.value, 3, 3)
-    query = torch.empty(found.value, dtype=torch.long)
-    _raise_for(
-        library.snarf_take_roots(
-            handle, c_void_p(canonical.data_ptr()), c_void_p(query.data_ptr()), c_void_p(inverse.data_ptr())
-        )
-    )
+    try:
+        canonical = points.new_empty(found.value, 3)
+        inverse = points.new_empty(found.value, 3, 3)
+        query = torch.empty(found.value, dtype=torch.long)
+    except BaseException:
+        library.snarf_take_roots(handle, None, None, None)
+        raise
+    results = (c_void_p(result.data_ptr()) for result in (canonical, query, inverse))
+    _raise_for(library.snarf_take_roots(handle, *results))
     return canonical, query, inverse
 
 

@@ -70,7 +70,9 @@ def complete_search(
         )
     else:
         settings = {"active_cells": active_cells, "tolerance": metres, "max_steps": max_steps}
-        found = _reference_result(complete_roots(points, transforms, grid, nodes, **settings), orientation_preserving)
+        with torch.autocast(points.device.type, enabled=False):
+            roots = complete_roots(points, transforms, grid, nodes, **settings)
+        found = _reference_result(roots, orientation_preserving)
     return _padded(*found, points, capacity)
 
 
@@ -98,25 +100,18 @@ def broyden_search(
         exact_jacobian: whether the inverse Jacobian is the exact one at the root or the iteration's approximation.
     """
     grid, nodes = _grid(lower, upper, shape)
-    settings = (max_steps, exact_jacobian, orientation_preserving)
+    rest = (max_steps, exact_jacobian, orientation_preserving)
     if points.is_cuda and _choose_cuda(backend) == "native":
         box = (lower, upper, shape)
-        return cuda.broyden_search(points, transforms, starts, *box, tolerance, divergence, *settings, capacity)
+        return cuda.broyden_search(points, transforms, starts, *box, tolerance, divergence, *rest, capacity)
     metres = (tolerance * grid.longest_side, divergence * grid.longest_side)
     if not points.is_cuda and choose_backend(backend) == "native":
-        found = native.broyden_search(points, transforms, starts, lower, grid.cell_size(nodes), nodes, *metres, *settings)
+        found = native.broyden_search(points, transforms, starts, lower, grid.cell_size(nodes), nodes, *metres, *rest)
     else:
-        roots = broyden_roots(
-            points,
-            transforms,
-            starts,
-            grid,
-            nodes,
-            exact_jacobian=exact_jacobian,
-            tolerance=metres[0],
-            divergence=metres[1],
-            max_steps=max_steps,
-        )
+        keys = ("exact_jacobian", "tolerance", "divergence", "max_steps")
+        settings = dict(zip(keys, (exact_jacobian, *metres, max_steps), strict=True))
+        with torch.autocast(points.device.type, enabled=False):
+            roots = broyden_roots(points, transforms, starts, grid, nodes, **settings)
         found = _reference_result(roots, orientation_preserving)
     return _padded(*found, points, capacity)
 
@@ -275,6 +270,7 @@ def _remember(ctx, inputs, output, lower: int) -> None:
     points, backend = inputs[0], inputs[-1]
     canonical, query, jacobian_inverse, _ = output
     ctx.save_for_backward(canonical, query, jacobian_inverse, inputs[lower], inputs[lower + 1])
+    ctx.mark_non_differentiable(query, jacobian_inverse, output[3])
     ctx.shape, ctx.backend, ctx.size = inputs[lower + 2], backend, points.shape[:2]
     ctx.inputs = len(inputs)
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from snarfcli.deformer.blending import blend
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.precision import matmul_precision
 
 __all__ = ["blend_transforms", "forward_jacobian", "interpolate", "skin"]
 
@@ -24,8 +25,9 @@ def skin(canonical: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
 
     Source: SNARF Eq. 4.
     """
-    blended = (weights @ bone_transforms[:, :3].reshape(len(bone_transforms), 12)).reshape(-1, 3, 4)
-    return (blended[:, :, :3] @ canonical[:, :, None])[:, :, 0] + blended[:, :, 3]
+    with matmul_precision("highest"), torch.autocast(canonical.device.type, enabled=False):
+        blended = (weights @ bone_transforms[:, :3].reshape(len(bone_transforms), 12)).reshape(-1, 3, 4)
+        return (blended[:, :, :3] @ canonical[:, :, None])[:, :, 0] + blended[:, :, 3]
 
 
 def blend_transforms(

@@ -128,7 +128,8 @@ class Trainer:
         avatar = copy.copy(self.avatar)
         avatar.model = copy.deepcopy(self.model)
         with torch.no_grad():
-            for parameter, average in zip(avatar.model.parameters(), self.average, strict=True):
+            trained = [p for p in avatar.model.parameters() if p.requires_grad]
+            for parameter, average in zip(trained, self.average, strict=True):
                 parameter.copy_(average)
         return avatar.to(self.device)
 

@@ -12,7 +12,7 @@ template <class S> struct Solver {
 };
 
 // A step this short, in cells, is the last: it leaves the Jacobian as it is to three digits (float) and, the method converging
-// quadratically, the root exact.
+// quadratically, the root exact. After max_steps a root is taken as it is, with the Jacobian where it was last evaluated.
 template <class S> constexpr S last_step() { return sizeof(S) == 4 ? S(2e-4) : S(1e-7); }
 // Beside a fold the step of a point whose residual is below the tolerance may be long; up to here it is taken.
 template <class S> constexpr S trusted_step() { return S(1e-2); }
@@ -50,7 +50,7 @@ SNARF_HD Mask solve_in_cell(const C* c, const V* offset, Mask going, const Solve
     V from_centre = longest_of(s[0], s[1], s[2]);
     for (int i = 0; i < 9; ++i) inverse[i] = select(done, adj[i] * reciprocal, inverse[i]);
     found = found | (done & (from_centre <= reach));
-    going = going & !done & (from_centre - S(0.5) < smaller(longest, longest * S(0) + stray<S>()));
+    going = going & !done & (from_centre - S(0.5) <= smaller(longest, longest * S(0) + stray<S>()));
     if (!any(going)) break;
   }
   return found;

@@ -31,6 +31,7 @@ NO_CORRESPONDENCE = -30.0
 """Logit of a point that no canonical point is moved onto: certainly outside."""
 
 _POINTS_AT_ONCE = 32_768  # canonical points in one call of the shape network; smaller calls stay in the cache
+_ROUND_NUMBER = 512  # of points in training: oneDNN compiles its matrix products anew for every size it has not met
 _SAMPLES_M = 0.04  # most distance of the samples that judge a cell; a wrist is 5 cm thick
 _KEPT_RADIUS_M = 0.1  # cells with a corner this near to a bone are searched whatever the field says
 _GROWTH_M = 0.06  # how far the cells searched in training reach beyond what might be occupied
@@ -202,7 +203,9 @@ class FastSnarf(nn.Module):
         """Return the canonical occupancy logits [M] of points [M, 3] under `condition[pose]` ([B, C] and [M])."""
         with network_precision(precision, canonical.device):
             if torch.is_grad_enabled():
-                return self.shape(canonical, condition, pose).to(canonical.dtype)
+                extra = -len(canonical) % _ROUND_NUMBER if canonical.device.type == "cpu" else 0
+                padded = self.shape(F.pad(canonical, (0, 0, 0, extra)), condition, F.pad(pose, (0, extra)))
+                return padded[: len(canonical)].to(canonical.dtype)
             chunks = zip(canonical.split(_POINTS_AT_ONCE), pose.split(_POINTS_AT_ONCE), strict=True)
             return torch.cat([self.shape(points, condition, index) for points, index in chunks]).to(canonical.dtype)
 

@@ -16,7 +16,7 @@ help:
 	@echo "make test      run the tests"
 	@echo "make sanitize  run the deformer's tests on a library built with address and undefined-behaviour checks (Linux)"
 	@echo "make lint      check the style of the code"
-	@echo "make bench     measure a training step, evaluation and mesh extraction"
+	@echo "make bench     measure the searches, a training step, evaluation and mesh extraction"
 	@echo "make clean     remove .venv, builds, samples and results"
 
 setup: $(INSTALLED)
@@ -43,6 +43,7 @@ lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
 
 bench: $(INSTALLED)
+	$(VENV)/bin/python benchmarks/bm_search.py
 	$(VENV)/bin/python benchmarks/bm_training.py
 	$(VENV)/bin/python benchmarks/bm_evaluation.py
 	$(VENV)/bin/python benchmarks/bm_extraction.py

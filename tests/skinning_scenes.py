@@ -61,6 +61,15 @@ def posed_queries(weights: Tensor, transforms: Tensor, count: int, seed: int = 0
     return move(canonical, weights, transforms, grid), canonical
 
 
+def scene(dtype=torch.float32, batch=2, count=40, bones=4, angle=0.6, shape=(6, 7, 8), seed=0):
+    """Return points [B, N, 3] with roots and some without, transforms and weights."""
+    weights = smooth_weights(shape, bones, seed, dtype)
+    transforms = random_transforms(batch, bones, angle, seed, dtype)
+    points = torch.stack([posed_queries(weights, pose, count, seed + 1)[0] for pose in transforms])
+    points[:, ::7] += 5.0
+    return points, transforms, weights
+
+
 def exhaustive_roots(points: Tensor, weights: Tensor, transforms: Tensor, grid: CanonicalGrid) -> list[Tensor]:
     """Return all roots of one pose in float64, a [K, 3] tensor for each query (see `deformer/ground_truth.py`)."""
     from ground_truth import true_roots  # beside the deformer's tests, which put their folder on the path

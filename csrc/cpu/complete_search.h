@@ -17,6 +17,7 @@
 #include <memory>
 #include <vector>
 
+#include "bins.h"
 #include "dispatch.h"
 #include "roots.h"
 #include "snarf/api.h"
@@ -215,26 +216,6 @@ template <class S> class CompleteSearch {
     for (auto& at : at_) at.reset(new S[poses_ * (count_ + kBlock)]);
   }
 
-  template <class F> void each_bin_row(const SortedQueries<S>& sorted, const BlockBoxes<S>& boxes, int k, const F& visit) const {
-    int32_t low[3], high[3];
-    for (int i = 0; i < 3; ++i) {
-      const S lower = boxes.lower[i][k], upper = boxes.upper[i][k];
-      if (!(lower <= upper && upper >= sorted.lower[i] && lower <= sorted.upper[i])) return;
-      low[i] = bin(sorted, i, lower);
-      high[i] = bin(sorted, i, upper);
-    }
-    for (int32_t z = low[2]; z <= high[2]; ++z)
-      for (int32_t y = low[1]; y <= high[1]; ++y) {
-        const int64_t row = (int64_t(z) * sorted.bins[1] + y) * sorted.bins[0];
-        visit(row + low[0], row + high[0] + 1);
-      }
-  }
-
-  static int32_t bin(const SortedQueries<S>& sorted, int axis, S position) {
-    const S at = (position - sorted.lower[axis]) * sorted.per_metre;
-    return at > 0 ? (at < S(sorted.bins[axis]) ? int32_t(at) : sorted.bins[axis] - 1) : 0;
-  }
-
   void mark() {
     for (int64_t first, last; mark_queue_.take(first, last);)
       for (int64_t n = first; n < last; ++n) {
@@ -242,7 +223,7 @@ template <class S> class CompleteSearch {
         if (bin_offset_[pose + 1] == bin_offset_[pose]) continue;
         std::atomic<uint8_t>* const marked = marked_.get() + bin_offset_[pose];
         for (int k = 0; k < kBlock; ++k)
-          each_bin_row(sorted_[pose], boxes_[n], k, [&](int64_t begin, int64_t end) {
+          SNARF_ISA::each_bin_row(sorted_[pose], boxes_[n], k, [&](int64_t begin, int64_t end) {
             for (int64_t bin = begin; bin < end; ++bin) marked[bin].store(1, std::memory_order_relaxed);
           });
       }

@@ -6,6 +6,7 @@
 // A cell that may hold several roots of one query is cut into eight parts, each of which fetches from its parent's candidates.
 #include "kernels.h"
 
+#include "bins.h"
 #include "lanes.h"
 #include "snarf/broyden.h"
 #include "snarf/cell.h"
@@ -39,6 +40,7 @@ template <class S> struct Search {
   int32_t cell;
 };
 
+// The grid as the shared mathematics knows it, in this instruction set's namespace.
 template <class S> Grid<S> grid_of(const Geometry<S>& geometry) {
   Grid<S> grid;
   for (int i = 0; i < 3; ++i) {
@@ -297,11 +299,6 @@ template <class S> void search_part(Search<S>& search, const Part<S>& part, int6
   }
 }
 
-template <class S> int32_t bin_of(const SortedQueries<S>& queries, int axis, S position) {
-  const S bin = (position - queries.lower[axis]) * queries.per_metre;
-  return bin > 0 ? (bin < S(queries.bins[axis]) ? int32_t(bin) : queries.bins[axis] - 1) : 0;
-}
-
 template <class S>
 void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>& boxes, Scratch<S>& scratch, RootSink<S>& sink) {
   using V = Lanes<S>;
@@ -313,21 +310,8 @@ void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>
     bool loaded = false;
     for (int lane = 0; lane < width; ++lane) {
       const int k = first + lane;
-      bool touched = true;
-      for (int i = 0; i < 3; ++i)
-        touched &= boxes.lower[i][k] <= boxes.upper[i][k] && boxes.upper[i][k] >= queries.lower[i] && boxes.lower[i][k] <= queries.upper[i];
-      if (!touched) continue;
-      int32_t low[3], high[3];
-      for (int i = 0; i < 3; ++i) {
-        low[i] = bin_of(queries, i, boxes.lower[i][k]);
-        high[i] = bin_of(queries, i, boxes.upper[i][k]);
-      }
       int64_t near = 0;
-      for (int32_t z = low[2]; z <= high[2]; ++z)
-        for (int32_t y = low[1]; y <= high[1]; ++y) {
-          const int64_t row = (int64_t(z) * queries.bins[1] + y) * queries.bins[0];
-          near += queries.begin[row + high[0] + 1] - queries.begin[row + low[0]];
-        }
+      each_bin_row(queries, boxes, k, [&](int64_t row, int64_t end) { near += queries.begin[end] - queries.begin[row]; });
       if (!near) continue;
       if (!loaded) {
         load_cells(task.transforms, task.geometry, block.x + first, block.y, block.z, cells.cell);
@@ -341,25 +325,23 @@ void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>
       part.scale = 1;
       part.shift[0] = part.shift[1] = part.shift[2] = 0;
       const Test<S> test(part);
-      int64_t end = 0;
-      for (int32_t z = low[2]; z <= high[2]; ++z)
-        for (int32_t y = low[1]; y <= high[1]; ++y) {
-          const int64_t row = (int64_t(z) * queries.bins[1] + y) * queries.bins[0];
-          const int32_t last = queries.begin[row + high[0] + 1];
-          for (int32_t i = queries.begin[row + low[0]]; i < last; i += width) {
-            const S *const px = queries.at[0] + i, *const py = queries.at[1] + i, *const pz = queries.at[2] + i;
-            uint32_t inside = bits(test(load<S>(px), load<S>(py), load<S>(pz)));
-            if (last - i < width) inside &= (1u << (last - i)) - 1;
-            end = append(scratch, end, inside, px, py, pz, queries.query + i);
-          }
+      int64_t kept = 0;
+      each_bin_row(queries, boxes, k, [&](int64_t row, int64_t end) {
+        const int32_t last = queries.begin[end];
+        for (int32_t i = queries.begin[row]; i < last; i += width) {
+          const S *const px = queries.at[0] + i, *const py = queries.at[1] + i, *const pz = queries.at[2] + i;
+          uint32_t inside = bits(test(load<S>(px), load<S>(py), load<S>(pz)));
+          if (last - i < width) inside &= (1u << (last - i)) - 1;
+          kept = append(scratch, kept, inside, px, py, pz, queries.query + i);
         }
-      if (!end) continue;
+      });
+      if (!kept) continue;
       const int32_t x = block.x + k;
       Search<S> here{task, scratch, sink, {}, 0};
       here.cell = int32_t((int64_t(block.z) * (task.geometry.nodes[1] - 1) + block.y) * (task.geometry.nodes[0] - 1) + x);
       const int32_t index[3] = {x, block.y, block.z};
       for (int i = 0; i < 3; ++i) here.centre[i] = task.geometry.lower[i] + (S(index[i]) + S(0.5)) * task.geometry.size[i];
-      search_part(here, part, 0, end);
+      search_part(here, part, 0, kept);
     }
   }
 }

@@ -113,23 +113,28 @@ bool valid(const snarf_field* field, const snarf_queries* queries) {
   return cells < std::numeric_limits<int32_t>::max() && queries->poses >= 0 && queries->count >= 0 && queries->threads >= 1;
 }
 
-// Runs a search in the number type of the field and hands its roots out; no exception leaves the library.
-template <class Run> int search_with(const snarf_field* field, const snarf_queries* queries, snarf_roots** roots, int64_t* found, const Run& run) {
-  if (!valid(field, queries) || !roots || !found) return SNARF_BAD_ARGUMENT;
+// Calls run(number) with a float or a double; no exception leaves the library.
+template <class Run> int in_number_type(int bytes, const Run& run) {
   try {
-    const auto go = [&](auto number) {
-      using S = decltype(number);
-      std::unique_ptr<RootsOf<S>> out(new RootsOf<S>());
-      out->threads = queries->threads;
-      run(number, *out);
-      *found = out->count();
-      *roots = out.release();
-    };
-    if (field->bytes_per_number == 4) go(float()); else go(double());
+    if (bytes == 4) run(float());
+    else run(double());
   } catch (...) {
     return SNARF_OUT_OF_MEMORY;
   }
   return SNARF_OK;
+}
+
+// Runs a search and hands its roots out.
+template <class Run>
+int search_with(const snarf_field* field, const snarf_queries* queries, snarf_roots** roots, int64_t* found, const Run& run) {
+  if (!valid(field, queries) || !roots || !found) return SNARF_BAD_ARGUMENT;
+  return in_number_type(field->bytes_per_number, [&](auto number) {
+    std::unique_ptr<RootsOf<decltype(number)>> out(new RootsOf<decltype(number)>());
+    out->threads = queries->threads;
+    run(*out);
+    *found = out->count();
+    *roots = out.release();
+  });
 }
 
 }  // namespace
@@ -142,45 +147,33 @@ const char* snarf_instruction_set(void) {
 
 int snarf_blend(const snarf_blending* blending, void* transforms) {
   if (!valid(blending)) return SNARF_BAD_ARGUMENT;
-  try {
-    const auto go = [&](auto number) {
-      using S = decltype(number);
-      Blending<S>(*blending).forward(static_cast<S*>(transforms));
-    };
-    if (blending->bytes_per_number == 4) go(float()); else go(double());
-  } catch (...) {
-    return SNARF_OUT_OF_MEMORY;
-  }
-  return SNARF_OK;
+  return in_number_type(blending->bytes_per_number, [&](auto number) {
+    using S = decltype(number);
+    Blending<S>(*blending).forward(static_cast<S*>(transforms));
+  });
 }
 
 int snarf_blend_backward(const snarf_blending* blending, const void* gradient, void* v_weights, void* v_bones) {
   if (!valid(blending)) return SNARF_BAD_ARGUMENT;
-  try {
-    const auto go = [&](auto number) {
-      using S = decltype(number);
-      Blending<S> task(*blending);
-      if (v_weights) task.weights(static_cast<const S*>(gradient), static_cast<S*>(v_weights));
-      if (v_bones) task.bones(static_cast<const S*>(gradient), static_cast<S*>(v_bones));
-    };
-    if (blending->bytes_per_number == 4) go(float()); else go(double());
-  } catch (...) {
-    return SNARF_OUT_OF_MEMORY;
-  }
-  return SNARF_OK;
+  return in_number_type(blending->bytes_per_number, [&](auto number) {
+    using S = decltype(number);
+    Blending<S> task(*blending);
+    if (v_weights) task.weights(static_cast<const S*>(gradient), static_cast<S*>(v_weights));
+    if (v_bones) task.bones(static_cast<const S*>(gradient), static_cast<S*>(v_bones));
+  });
 }
 
 int snarf_complete_search(const snarf_field* field, const snarf_queries* queries, const snarf_complete* settings, snarf_roots** roots,
                           int64_t* found) {
   if (!settings) return SNARF_BAD_ARGUMENT;
   return search_with(field, queries, roots, found,
-                     [&](auto, auto& out) { complete_search(*field, *queries, *settings, out); });
+                     [&](auto& out) { complete_search(*field, *queries, *settings, out); });
 }
 
 int snarf_broyden_search(const snarf_field* field, const snarf_queries* queries, const snarf_broyden* settings, snarf_roots** roots,
                          int64_t* found) {
   if (!settings || settings->count < 0) return SNARF_BAD_ARGUMENT;
-  return search_with(field, queries, roots, found, [&](auto, auto& out) { broyden_search(*field, *queries, *settings, out); });
+  return search_with(field, queries, roots, found, [&](auto& out) { broyden_search(*field, *queries, *settings, out); });
 }
 
 int snarf_take_roots(snarf_roots* roots, void* canonical, int64_t* query, void* jacobian_inverse) {
@@ -197,15 +190,9 @@ int snarf_implicit_backward(const snarf_field* field, const snarf_queries* queri
                             const void* canonical, const int64_t* query, const void* jacobian_inverse, void* v_points,
                             void* v_transforms) {
   if (!valid(field, queries) || roots < 0) return SNARF_BAD_ARGUMENT;
-  try {
-    const auto go = [&](auto number) {
-      using S = decltype(number);
-      implicit_backward(*field, *queries, roots, static_cast<const S*>(gradient), static_cast<const S*>(canonical), query,
-                        static_cast<const S*>(jacobian_inverse), static_cast<S*>(v_points), static_cast<S*>(v_transforms));
-    };
-    if (field->bytes_per_number == 4) go(float()); else go(double());
-  } catch (...) {
-    return SNARF_OUT_OF_MEMORY;
-  }
-  return SNARF_OK;
+  return in_number_type(field->bytes_per_number, [&](auto number) {
+    using S = decltype(number);
+    implicit_backward(*field, *queries, roots, static_cast<const S*>(gradient), static_cast<const S*>(canonical), query,
+                      static_cast<const S*>(jacobian_inverse), static_cast<S*>(v_points), static_cast<S*>(v_transforms));
+  });
 }

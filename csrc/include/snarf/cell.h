@@ -9,7 +9,7 @@
 //   preconditioned      |J0^-1 (d - d(0)) - s|_i <= sum_{m nonlinear} |J0^-1 c_m|_i (1/2)^deg(m)
 //   its derivative      row sums           <= sum_{m nonlinear} |J0^-1 c_m|_i deg(m) (1/2)^(deg(m)-1)  =: curvature
 // Curvature below one proves that d is injective in the cell: at most one root. Below about 3/4 it also proves that Newton's method
-// from the affine guess finds it; up to 0.9 (kTame) no miss was ever measured (tests/deformer/test_ops.py, benchmarks/bm_search.py).
+// from the affine guess finds it; up to 0.9 (kTame) no miss was ever measured (tests/deformer/test_native_search.py).
 // A cell beyond that (next to a fold, where det J changes sign, it always is) is cut into eight, again and again.
 #pragma once
 

@@ -1,0 +1,34 @@
+// Which bins of the sorted queries a place or a box touches: the library that marks bins and the kernels that read them must agree.
+#pragma once
+
+#include "kernels.h"
+#include "snarf/platform.h"
+
+namespace snarf {
+namespace SNARF_ISA {
+
+// Grows with the position, so that a query inside a box never lies outside the box's bins.
+template <class S> SNARF_HD int32_t bin_along(const SortedQueries<S>& queries, int axis, S position) {
+  const S at = (position - queries.lower[axis]) * queries.per_metre;
+  return at > 0 ? (at < S(queries.bins[axis]) ? int32_t(at) : queries.bins[axis] - 1) : 0;
+}
+
+// Calls visit(first, behind the last) for each row of bins that the box of cell k of a block touches.
+template <class S, class F>
+SNARF_HD void each_bin_row(const SortedQueries<S>& queries, const BlockBoxes<S>& boxes, int k, const F& visit) {
+  int32_t low[3], high[3];
+  for (int i = 0; i < 3; ++i) {
+    const S lower = boxes.lower[i][k], upper = boxes.upper[i][k];
+    if (!(lower <= upper && upper >= queries.lower[i] && lower <= queries.upper[i])) return;
+    low[i] = bin_along(queries, i, lower);
+    high[i] = bin_along(queries, i, upper);
+  }
+  for (int32_t z = low[2]; z <= high[2]; ++z)
+    for (int32_t y = low[1]; y <= high[1]; ++y) {
+      const int64_t row = (int64_t(z) * queries.bins[1] + y) * queries.bins[0];
+      visit(row + low[0], row + high[0] + 1);
+    }
+}
+
+}  // namespace SNARF_ISA
+}  // namespace snarf

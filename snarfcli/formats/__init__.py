@@ -1,0 +1,1 @@
+"""Foreign files, read into plain structures without executing anything in them."""

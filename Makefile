@@ -8,12 +8,13 @@ SNARF := $(VENV)/bin/snarf
 SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
 
-.PHONY: help setup demo test sanitize lint bench clean
+.PHONY: help setup demo test fuzz sanitize lint bench clean
 
 help:
 	@echo "make setup     install snarf into $(VENV)"
 	@echo "make demo      the whole job on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
 	@echo "make test      run the tests"
+	@echo "make fuzz      feed every reader of foreign files with 20,000 broken ones"
 	@echo "make sanitize  run the deformer's tests on a library built with address and undefined-behaviour checks (Linux)"
 	@echo "make lint      check the style of the code"
 	@echo "make bench     measure the searches, a training step, evaluation and mesh extraction"
@@ -35,6 +36,9 @@ demo: $(INSTALLED)
 
 test: $(INSTALLED)
 	$(VENV)/bin/python -m pytest -q -n auto
+
+fuzz: $(INSTALLED)
+	$(VENV)/bin/python tools/fuzz_readers.py --count 20000
 
 sanitize: $(INSTALLED)
 	tools/sanitize.sh $(VENV)

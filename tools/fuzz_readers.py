@@ -1,0 +1,111 @@
+"""Feed every reader of foreign files with broken ones, and say how it bore up: the long form of `tests/test_fuzz.py`.
+
+    python tools/fuzz_readers.py --count 20000
+    python tools/fuzz_readers.py --count 20000 --only bvh gltf
+
+Each reader runs in a process of its own with limited memory, so that a crash or a bomb ends that process alone; the file that
+did it is kept. Ends with exit code 1 if any file was mishandled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from fuzz_targets import TARGETS  # noqa: E402
+from fuzzing import find_failures, scratch_folder  # noqa: E402
+
+_MAX_FAILURES = 20
+# Address space above what the reader's modules take: far over the 1 GiB that a file may cost, since not all of it is used.
+_SPARE_ADDRESSES = 3 * 2**30
+
+
+def main() -> int:
+    names = [make.__name__ for make in TARGETS]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=20000, help="broken files for each reader")
+    parser.add_argument("--seed", type=int, default=1, help="another seed breaks them in other ways")
+    parser.add_argument("--only", nargs="+", metavar="NAME", choices=names, help=f"readers: {', '.join(names)}")
+    parser.add_argument("--folder", type=Path, default=Path("outputs/fuzz"), help="where failing files are kept")
+    parser.add_argument("--child", nargs=2, metavar=("START", "SCRATCH"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        return _read_files(options.only[0], int(options.child[0]), Path(options.child[1]), options)
+    total = 0
+    for name in options.only or names:
+        start = time.monotonic()
+        failures = _supervise(name, options)
+        total += len(failures)
+        seconds = time.monotonic() - start
+        print(f"{name:16} {options.count} files, {len(failures)} failures, {seconds:.0f} s", flush=True)
+        for failure in failures:
+            print("    " + failure.replace("\n", "\n    "), flush=True)
+    return 1 if total else 0
+
+
+def _supervise(name: str, options: argparse.Namespace) -> list[str]:
+    """Run one reader's child process until it has read all its files, and again after each crash."""
+    failures: list[str] = []
+    start = 0
+    with scratch_folder() as scratch:
+        while start < options.count and len(failures) < _MAX_FAILURES:
+            shutil.rmtree(scratch)
+            scratch.mkdir()
+            child = subprocess.run(
+                [sys.executable, __file__, "--count", str(options.count), "--seed", str(options.seed), "--only", name,
+                 "--folder", str(options.folder), "--child", str(start), str(scratch)],
+                capture_output=True, text=True, errors="replace",
+            )  # fmt: skip
+            failures += [part for part in child.stdout.split("\0") if part.strip()]
+            if child.returncode == 0:
+                break
+            end = "\n".join(child.stderr.strip().splitlines()[-25:])
+            index = int((scratch / "index").read_text()) if (scratch / "index").exists() else -1
+            if index < 0:
+                failures.append(f"{name}: could not start (exit code {child.returncode})\n{end}")
+                break
+            options.folder.mkdir(parents=True, exist_ok=True)
+            (file,) = scratch.glob("fuzz*")
+            kept = options.folder / f"{name}-{options.seed}-{index}{file.suffix}"
+            shutil.copyfile(file, kept)
+            failures.append(f"{name}: file {index} ended the process (exit code {child.returncode}), kept as {kept}\n{end}")
+            start = index + 1
+    return failures
+
+
+def _read_files(name: str, start: int, scratch: Path, options: argparse.Namespace) -> int:
+    """The child process: print each failure, ended by a zero byte."""
+    import faulthandler
+
+    faulthandler.enable()  # a crash prints where it happened
+    target = next(make for make in TARGETS if make.__name__ == name)()
+    for _ in find_failures(target, [], options.seed, options.folder, scratch):  # imports all, and reads the seeds
+        pass
+    _limit_memory()
+    failures = find_failures(target, range(start, options.count), options.seed, options.folder, scratch)
+    for failure in itertools.islice(failures, _MAX_FAILURES):
+        print(failure, end="\0", flush=True)
+    return 0
+
+
+def _limit_memory() -> None:
+    """Make allocations beyond what any file may need fail, on Linux."""
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return
+    import resource
+
+    line = next(line for line in status.read_text().splitlines() if line.startswith("VmSize"))
+    limit = int(line.split()[1]) * 1024 + _SPARE_ADDRESSES
+    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from snarfcli.bodies import axis_angle_to_matrix
-from snarfcli.datasets.subjects import SubjectData, builtin_subject
+from snarfcli.datasets.builtin import builtin_subject
+from snarfcli.datasets.subjects import SubjectData
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.models.extent import weight_segments
 from snarfcli.motions import builtin_motion
@@ -115,9 +116,8 @@ def _subject() -> SubjectData:
 @lru_cache(maxsize=1)
 def _canonical_mesh() -> tuple[np.ndarray, np.ndarray]:
     """Return vertices [V, 3], float64, and faces of the built-in subject in the canonical pose."""
-    subject = _subject()
-    posed = subject.body.pose(subject.skeleton.canonical_pose[None], subject.betas)
-    return posed.vertices[0].double().numpy(), subject.body.faces.numpy()
+    template = _subject().template
+    return template.vertices, template.faces
 
 
 @lru_cache(maxsize=8)
@@ -128,7 +128,7 @@ def _body_field(kind: str, resolution: tuple[int, int, int]) -> tuple[CanonicalG
     shape = (resolution[2], resolution[1], resolution[0])
     nodes = grid.nodes(shape).reshape(-1, 3)
     if kind == "body's weights":
-        weights = _diffused(vertices, _subject().body.weights.double().numpy(), nodes.double().numpy(), shape)
+        weights = _diffused(vertices, _subject().template.weights.astype(np.float64), nodes.double().numpy(), shape)
     elif kind == "distances to bones, 1 cm":
         segments, owner = weight_segments(_subject().skeleton)
         distance = torch.full((len(nodes), 24), torch.inf)

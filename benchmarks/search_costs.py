@@ -108,7 +108,7 @@ class _Step:
 
         from snarfcli.cli import register_schemas
         from snarfcli.commands.train import TrainConfig
-        from snarfcli.datasets.subjects import builtin_subject
+        from snarfcli.datasets.builtin import builtin_subject
         from snarfcli.models.fast_snarf import AvatarConfig, FastSnarf
         from snarfcli.settings import config_folder
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from snarfcli.bodies import Body
-from snarfcli.datasets.subjects import SequenceSpec, SubjectData
+from snarfcli.datasets.subjects import SubjectData, body_sequence, body_template
 from snarfcli.motions import Motion
 
 RADIUS = 0.1
@@ -83,9 +83,13 @@ def bending(name: str, frames: int, reach_rad: float) -> Motion:
     return Motion(name, poses, translation, 30.0)
 
 
-def toy_subject(subject: str = "toy", train_frames: int = 34) -> SubjectData:
+def toy_subject(subject: str = "toy", train_frames: int = 34, body: Body | None = None) -> SubjectData:
     """Return a subject with one training sequence, one held out and one that bends further."""
-    body = toy_body()
+    body = body or toy_body()
+    betas = np.zeros(1)
+    skeleton = body.skeleton(betas)
     motions = (("train", "bend", train_frames, 1.0), ("test", "wave", 3, 0.8), ("ood", "fold", 2, 1.6))
-    specs = tuple(SequenceSpec(name, split, bending(name, frames, reach)) for split, name, frames, reach in motions)
-    return SubjectData("builtin", subject, body, np.zeros(1), body.skeleton(np.zeros(1)), specs)
+    specs = tuple(
+        body_sequence(name, split, bending(name, frames, reach), body, betas) for split, name, frames, reach in motions
+    )
+    return SubjectData("builtin", subject, skeleton, specs, body_template(body, betas, skeleton), betas)

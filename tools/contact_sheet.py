@@ -34,7 +34,7 @@ def main() -> None:
             sequence = next(s for s in store.sequences("test" if split == "id" else "ood") if s.name == name)
             index = int(at * sequence.num_frames)
             pictures, _ = draw_frame(
-                avatar, store.faces, sequence, index, resolution=options.resolution, size=options.size
+                avatar, sequence, index, resolution=options.resolution, size=options.size
             )
             truths.append(pictures[0])
             predictions.append(pictures[1])

@@ -15,8 +15,8 @@ import torch
 from omegaconf import MISSING
 
 from snarfcli.checks import check_choice, check_number
+from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.subjects import BUILTIN_SUBJECTS, builtin_subject
 from snarfcli.errors import UserError
 from snarfcli.export.animation import Animation
 from snarfcli.export.meshes import MESH_WRITERS

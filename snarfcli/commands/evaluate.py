@@ -11,9 +11,9 @@ from pathlib import Path
 from omegaconf import MISSING
 
 from snarfcli.checks import check_choice, check_number, check_search
+from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.store import SampleStore, samples_folder
-from snarfcli.datasets.subjects import builtin_subject
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import evaluate
@@ -128,7 +128,6 @@ def run(config: EvalConfig) -> None:
         write_figure(
             folder / "frames.png",
             avatar,
-            store.faces,
             sequences,
             frames,
             count=config.figure_frames,

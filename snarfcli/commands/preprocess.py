@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from omegaconf import MISSING
 
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.errors import UserError, nearest
+from snarfcli.errors import UserError
 
 __all__ = ["PreprocessConfig", "run"]
 
@@ -26,6 +26,8 @@ class PreprocessConfig:
     """The data set."""
     data_root: str = MISSING
     """The data folder; samples go under `processed/{data}/{subject}` in it."""
+    body: str | None = MISSING
+    """Body model, or a folder in which it lies under the name it is downloaded with; null: looked for below data_root."""
     points_per_frame: int = MISSING
     """Points a frame, a multiple of 8: half uniform in the papers' box, half near the surface."""
     surface_noise_m: float = MISSING
@@ -42,6 +44,8 @@ class PreprocessConfig:
     """Discard the samples that are there and start again."""
     sequences: list[str] = MISSING
     """Names of the sequences to make; all if empty."""
+    skip_broken: bool = MISSING
+    """Leave out sequences that cannot be used, and list them, instead of stopping."""
 
 
 def run(config: PreprocessConfig) -> None:
@@ -52,9 +56,10 @@ def run(config: PreprocessConfig) -> None:
         OSError: the data folder cannot be written to, or the disk is full.
     """
     from snarfcli.datasets.preprocessing import preprocess_subject
+    from snarfcli.datasets.sources import Request, find_source
     from snarfcli.sampling import SamplingSettings, count_cores
 
-    known, load = _subjects(config.data.name)
+    source = find_source(config.data.name)
     sampling = SamplingSettings(
         points_per_frame=config.points_per_frame,
         surface_noise_m=config.surface_noise_m,
@@ -73,9 +78,12 @@ def run(config: PreprocessConfig) -> None:
     if config.workers < 0:
         raise UserError(f"workers: wanted a number of processes, or 0 for one a core, got {config.workers}")
     workers = config.workers or count_cores()
-    for subject in known if config.subject == "all" else [config.subject]:
-        data = load(subject)
-        log.info("subject %s of %s data, %d processes", subject, data.data, workers)
+    request = Request(config.data, Path(config.data_root), config.body)
+    for subject in source.subjects(request) if config.subject == "all" else [config.subject]:
+        data = source.load(subject, request)
+        log.info("subject %s of %s data, %d processes", data.subject, data.data, workers)
+        for line in data.sources:
+            log.info("from %s", line)
         preprocess_subject(
             data,
             config.data_root,
@@ -84,14 +92,5 @@ def run(config: PreprocessConfig) -> None:
             workers=workers,
             overwrite=config.overwrite,
             sequences=config.sequences,
+            skip_broken=config.skip_broken,
         )
-
-
-def _subjects(data: str) -> tuple[Sequence[str], Callable]:
-    """Return the subjects of a data set and the function that loads one."""
-    from snarfcli.datasets.subjects import BUILTIN_SUBJECTS, builtin_subject
-
-    sources = {"builtin": (BUILTIN_SUBJECTS, builtin_subject)}
-    if data not in sources:
-        raise UserError(f"no data set '{data}'{nearest(data, sources)}; there is {', '.join(sources)}")
-    return sources[data]

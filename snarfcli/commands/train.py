@@ -13,9 +13,9 @@ import torch
 from omegaconf import MISSING, OmegaConf
 
 from snarfcli.checks import check_choice, check_number, check_search, check_skinning
+from snarfcli.datasets.builtin import check_subject
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.store import SampleStore, samples_folder
-from snarfcli.datasets.subjects import check_subject
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from snarfcli.datasets.store import samples_folder
+from snarfcli.bodies import Skeleton, invert_rigid
+from snarfcli.datasets.store import SEQUENCE_FILES, samples_folder
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.datasets.writing import (
     SequenceWriter,
@@ -29,7 +30,7 @@ from snarfcli.datasets.writing import (
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json, read_npz
 from snarfcli.progress import progress
-from snarfcli.sampling import SamplingSettings, check_mesh, run_in_processes, sample_frames
+from snarfcli.sampling import BrokenFrame, SamplingSettings, check_mesh, run_in_processes, sample_frames
 
 __all__ = ["preprocess_subject"]
 
@@ -48,6 +49,7 @@ class _Job:
     arrays: dict[str, np.ndarray]
     writer: SequenceWriter
     frames_left: int
+    is_broken: bool = False
 
 
 def preprocess_subject(
@@ -59,23 +61,26 @@ def preprocess_subject(
     workers: int = 1,
     overwrite: bool = False,
     sequences: Sequence[str] = (),
+    skip_broken: bool = False,
 ) -> dict[str, Any]:
     """Make the samples of one subject, or those that are still missing, and return the manifest.
 
     Args:
-        subject: body, shape and motions.
+        subject: skeleton and sequences.
         root: the data folder; the samples go under `processed/{data}/{subject}`.
         sampling: how points are chosen and labelled.
         frame_steps: for each split, every how many frames of the motion one is taken.
         workers: number of processes.
         overwrite: discard the samples that are there.
         sequences: names of the sequences to make, all if empty.
+        skip_broken: leave out sequences that cannot be used, and say so, instead of stopping.
 
     Raises:
-        UserError: the samples there were made with other settings or from other motion, a sequence is unknown, a mesh
-            cannot be labelled, or another process works in the same folder.
+        UserError: the samples there were made with other settings or from other motion, a sequence is unknown or cannot be
+            used, or another process works in the same folder.
         OSError: the disk is full or cannot be written to. Sequences that were complete stay; nothing half-made does.
     """
+    broken = _report_broken(subject, sequences, skip_broken)
     chosen = _choose(subject, sequences)
     settings = {
         "data": subject.data,
@@ -91,22 +96,25 @@ def preprocess_subject(
                 discard_samples(folder)
             refuse_other_settings(folder, settings)
             started = time.monotonic()
-            faces, boundary_edges = _write_subject(folder, subject, sampling.inside_test)
+            _write_subject(folder, subject, sampling.inside_test)
             done = _complete_sequences(folder, subject, settings, frame_steps)
             missing = [spec for spec in chosen if (spec.split, spec.name) not in done]
             if len(missing) < len(chosen):
                 log.info("%d of %d sequences are there already", len(chosen) - len(missing), len(chosen))
-            made = _make_sequences(folder, subject, missing, faces, boundary_edges == 0, sampling, settings, workers)
+            made = _make_sequences(folder, subject, missing, sampling, settings, workers, broken if skip_broken else None)
             done.update({(entry["split"], entry["name"]): entry for entry in made})
+            if not done:
+                raise UserError(f"subject {subject.subject} of {subject.data} data has no sequence that can be used")
             seconds = time.monotonic() - started
             entries = [done[spec.split, spec.name] for spec in subject.sequences if (spec.split, spec.name) in done]
             header = {
                 "made_by": "snarf preprocess",
                 "data": subject.data,
                 "subject": subject.subject,
+                "sources": list(subject.sources),
+                "skipped": [{"name": name, "reason": reason} for name, reason in broken],
                 "settings": settings,
                 "versions": _versions(),
-                "boundary_edges": boundary_edges,
             }
             manifest = write_manifest(folder, header, entries)
         except BaseException as error:
@@ -118,52 +126,63 @@ def preprocess_subject(
     return manifest
 
 
+def _report_broken(subject: SubjectData, names: Sequence[str], skip_broken: bool) -> list[tuple[str, str]]:
+    """Return the sequences that the data set could not read, among those asked for; refuse them unless they may be left out."""
+    broken = [(name, reason) for name, reason in subject.broken if not names or name in names]
+    if broken and not skip_broken:
+        name, reason = broken[0]
+        more = f" ({len(broken) - 1} more like it)" if len(broken) > 1 else ""
+        raise UserError(f"sequence {name} cannot be used: {reason}{more}; give skip_broken=true to leave such sequences out")
+    for name, reason in broken:
+        log.warning("left out: sequence %s (%s)", name, reason)
+    return broken
+
+
 def _choose(subject: SubjectData, names: Sequence[str]) -> list[SequenceSpec]:
     known = [spec.name for spec in subject.sequences]
     for name in names:
-        if name not in known:
+        if name not in known and name not in (broken for broken, _ in subject.broken):
             raise UserError(f"subject {subject.subject} has no sequence '{name}'{nearest(name, known)}")
     return [spec for spec in subject.sequences if not names or spec.name in names]
 
 
-def _write_subject(folder: Path, subject: SubjectData, inside_test: str) -> tuple[np.ndarray, int]:
-    """Write `subject.npz`, or check that the one there is of the same body; return faces and boundary edges."""
-    body, skeleton = subject.body.to(torch.float64), subject.skeleton.to(torch.float64)
-    canonical = body.pose(skeleton.canonical_pose[None], subject.betas).vertices[0].numpy()
-    faces = body.faces.numpy().astype(np.int32)
-    boundary_edges = check_mesh(canonical, faces, inside_test, f"the mesh of subject {subject.subject}")
-    if boundary_edges:
-        log.warning(
-            "the mesh of subject %s is open, %d boundary edges: labelled by winding number, inside is above a half",
-            subject.subject,
-            boundary_edges,
-        )
+def _write_subject(folder: Path, subject: SubjectData, inside_test: str) -> None:
+    """Write `subject.npz`, or check that the one there is of the same subject."""
+    skeleton, template = subject.skeleton, subject.template
     arrays = {
         "names": np.array(skeleton.names),
         "parents": np.array(skeleton.parents, np.int32),
         "joints_rest": skeleton.joints_rest.numpy().astype(np.float32),
         "canonical_pose": skeleton.canonical_pose.numpy().astype(np.float32),
-        "faces": faces,
-        "vertices_canonical": canonical.astype(np.float32),
-        "vertex_weights": body.weights.numpy().astype(np.float32),
         "betas": np.asarray(subject.betas, np.float32),
     }
+    if template is not None:
+        boundary_edges = check_mesh(template.vertices, template.faces, inside_test, f"the mesh of subject {subject.subject}")
+        if boundary_edges:
+            log.warning(
+                "the mesh of subject %s is open, %d boundary edges: labelled by winding number, inside is above a half",
+                subject.subject, boundary_edges,
+            )  # fmt: skip
+        arrays |= {
+            "faces": template.faces.astype(np.int32),
+            "vertices_canonical": template.vertices.astype(np.float32),
+            "vertex_weights": template.weights.astype(np.float32),
+        }
     path = folder / "subject.npz"
     if not path.exists():
         write_arrays(path, arrays)
-        return faces, boundary_edges
+        return
     there = read_npz(path, "samples")
-    for name, array in arrays.items():
-        same = name in there and there[name].shape == array.shape
-        if same and array.dtype.kind == "f":
-            same = np.allclose(there[name], array, rtol=0.0, atol=_POSE_TOLERANCE)
+    for name in sorted(arrays.keys() | there.keys()):
+        same = name in arrays and name in there and there[name].shape == arrays[name].shape
+        if same and arrays[name].dtype.kind == "f":
+            same = np.allclose(there[name], arrays[name], rtol=0.0, atol=_POSE_TOLERANCE)
         elif same:
-            same = np.array_equal(there[name], array)
+            same = np.array_equal(there[name], arrays[name])
         if not same:
             raise UserError(
                 f"the samples in {folder} were made from another body ({name} differs); start again with overwrite=true"
             )
-    return faces, boundary_edges
 
 
 def _complete_sequences(
@@ -176,62 +195,71 @@ def _complete_sequences(
         if not (place / "sequence.json").exists():
             continue
         entry = read_json(place / "sequence.json", "samples")
-        sizes = {name: (place / name).stat().st_size if (place / name).exists() else None for name in entry["files"]}
+        sizes = {name: (place / name).stat().st_size if (place / name).exists() else None for name in SEQUENCE_FILES}
         if entry["settings_digest"] != settings_digest(settings) or any(
-            sizes[name] != described["bytes"] for name, described in entry["files"].items()
+            size is None or size != entry["files"].get(name, {}).get("bytes") for name, size in sizes.items()
         ):
             log.warning("%s/%s is damaged and is made again", spec.split, spec.name)
             continue
-        there = read_npz(place / "frames.npz", "samples")
         frames = _frame_numbers(spec, frame_steps)
-        wanted = {"poses": spec.motion.poses[frames], "translation": spec.motion.translation[frames]}
-        for name, array in wanted.items():
-            if there[name].shape != array.shape or not np.allclose(there[name], array, rtol=0.0, atol=_POSE_TOLERANCE):
-                raise UserError(f"{place} was made from another motion ({name} differs); start again with overwrite=true")
+        there, wanted = read_npz(place / "frames.npz", "samples"), _frame_arrays(subject.skeleton, spec, frames)
+        differs = [
+            name
+            for name, array in wanted.items()
+            if there[name].shape != array.shape or not np.allclose(there[name], array, rtol=0.0, atol=_POSE_TOLERANCE)
+        ]
+        if not differs and entry.get("source") != spec.meshes.fingerprint():
+            differs = ["its files"]
+        if differs:
+            raise UserError(f"{place} was made from another motion ({differs[0]} differs); start again with overwrite=true")
         done[spec.split, spec.name] = entry
     return done
 
 
 def _frame_numbers(spec: SequenceSpec, frame_steps: Mapping[str, int]) -> np.ndarray:
+    """Return the numbers of the frames to sample."""
+    if spec.frames is not None:
+        return np.asarray(spec.frames, np.int64)
     return np.arange(0, spec.motion.num_frames, frame_steps[spec.split])
 
 
-def _pose_frames(subject: SubjectData, spec: SequenceSpec, frames: np.ndarray) -> dict[str, np.ndarray]:
-    """Pose the mesh in the chosen frames and return what `frames.npz` holds: float32, metres and radians."""
-    body, skeleton = subject.body.to(torch.float64), subject.skeleton.to(torch.float64)
+def _frame_arrays(skeleton: Skeleton, spec: SequenceSpec, frames: np.ndarray) -> dict[str, np.ndarray]:
+    """Return what `frames.npz` says about the chosen frames: float32, metres and radians."""
+    skeleton = skeleton.to(torch.float64)
     pose = torch.from_numpy(spec.motion.poses[frames])
     translation = torch.from_numpy(spec.motion.translation[frames])
-    posed = [
-        body.pose(pose[i : i + 1], subject.betas, translation[i : i + 1])
-        for i in range(len(frames))  # one at a time: the pose correctives of many are large
-    ]
-    vertices = torch.cat([one.vertices for one in posed]).numpy().astype(np.float32)
-    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=(1, 2)))
-    if len(bad):
-        raise UserError(f"{spec.name} has NaN or infinite vertices in frame {frames[bad[0]]}; repair its poses first")
-    return {
-        "poses": pose.numpy().astype(np.float32),
-        "translation": translation.numpy().astype(np.float32),
-        "posed_from_canonical": skeleton.posed_from_canonical(pose, translation).numpy().astype(np.float32),
-        "joints": torch.cat([one.joints for one in posed]).numpy().astype(np.float32),
-        "vertices": vertices,
-        "box_lower": vertices.min(axis=1),
-        "box_upper": vertices.max(axis=1),
-        "frame_numbers": frames,
+    if spec.posed_from_rest is None:
+        posed_from_rest = skeleton.posed_from_rest(pose, translation)
+    else:
+        posed_from_rest = torch.from_numpy(spec.posed_from_rest[frames])
+    canonical_from_rest = skeleton.posed_from_rest(skeleton.canonical_pose[None])
+    joints = torch.einsum("tjrc,jc->tjr", posed_from_rest[..., :3, :3], skeleton.joints_rest) + posed_from_rest[..., :3, 3]
+    arrays = {
+        "poses": pose,
+        "translation": translation,
+        "posed_from_canonical": posed_from_rest @ invert_rigid(canonical_from_rest),
+        "joints": joints,
     }
+    for name, array in arrays.items():
+        bad = np.flatnonzero(~array.isfinite().flatten(1).all(1).numpy())
+        if len(bad):
+            raise UserError(f"{spec.name} has NaN or infinite {name} in frame {frames[bad[0]]}; repair its poses first")
+    return {name: array.numpy().astype(np.float32) for name, array in arrays.items()} | {"frame_numbers": frames}
 
 
 def _make_sequences(
     folder: Path,
     subject: SubjectData,
     specs: Sequence[SequenceSpec],
-    faces: np.ndarray,
-    is_closed: bool,
     sampling: SamplingSettings,
     settings: Mapping[str, Any],
     workers: int,
+    broken: list[tuple[str, str]] | None,
 ) -> list[dict[str, Any]]:
-    """Sample and write sequences; each appears when its last frame is in. Return their descriptions."""
+    """Sample and write sequences; each appears when its last frame is in. Return their descriptions.
+
+    One that turns out to be unusable is added to `broken`, or is an error if that is None.
+    """
     steps = {split: settings[f"{split}_frame_step"] for split in ("train", "test", "ood")}
     jobs: list[_Job] = []
     places: list[tuple[_Job, int]] = []  # of each task: its sequence, and the next frame that it will send
@@ -239,14 +267,16 @@ def _make_sequences(
     def tasks() -> Iterator[tuple[Any, ...]]:
         for spec in specs:
             frames = _frame_numbers(spec, steps)
-            arrays = _pose_frames(subject, spec, frames)
+            arrays = _frame_arrays(subject.skeleton, spec, frames)
             writer = SequenceWriter(folder / spec.split / spec.name, len(frames), sampling.points_per_frame)
-            jobs.append(_Job(spec, arrays, writer, len(frames)))
+            job = _Job(spec, arrays, writer, len(frames))
+            jobs.append(job)
             for start in range(0, len(frames), _FRAMES_PER_TASK):
-                places.append((jobs[-1], start))
-                part = slice(start, start + _FRAMES_PER_TASK)
-                names = (subject.subject, spec.name)
-                yield arrays["vertices"][part], faces, sampling, names, frames[part], is_closed
+                if job.is_broken:
+                    break
+                places.append((job, start))
+                part = frames[start : start + _FRAMES_PER_TASK]
+                yield spec.meshes.chosen(part), sampling, (subject.subject, spec.name), part
 
     made = []
     total = sum(len(_frame_numbers(spec, steps)) for spec in specs)
@@ -255,6 +285,16 @@ def _make_sequences(
         for task, samples in progress(results, total=total, desc=f"preprocess {subject.subject}", unit="frames"):
             job, frame = places[task]
             places[task] = (job, frame + 1)
+            if isinstance(samples, BrokenFrame):
+                if broken is None:
+                    raise UserError(f"{samples.message}; give skip_broken=true to leave such sequences out")
+                if not job.is_broken:
+                    log.warning("left out: sequence %s (%s)", job.spec.name, samples.message)
+                    broken.append((job.spec.name, samples.message))
+                    job.is_broken = True
+                    job.writer.discard()
+            if job.is_broken:
+                continue
             job.writer.write_frame(frame, samples)
             job.frames_left -= 1
             if job.frames_left == 0:
@@ -262,20 +302,28 @@ def _make_sequences(
                     "name": job.spec.name,
                     "split": job.spec.split,
                     "frame_rate": job.spec.motion.frame_rate,
+                    "source": job.spec.meshes.fingerprint(),
                     "settings": settings,
                 }
                 made.append(job.writer.finish(job.arrays, description))
                 job.arrays = {}
-                log.info(
-                    "%s/%s: %d frames, %.2f %% of the points inside, %.3f %% self-intersecting",
-                    job.spec.split, job.spec.name, made[-1]["frames"],
-                    100 * made[-1]["inside_share"], 100 * made[-1]["self_intersecting_share"],
-                )  # fmt: skip
+                _report_sequence(made[-1])
     finally:
         results.close()
         for job in jobs:
             job.writer.discard()
     return made
+
+
+def _report_sequence(entry: Mapping[str, Any]) -> None:
+    open_mesh = f", open meshes (up to {entry['boundary_edges']} boundary edges)" if entry["boundary_edges"] else ""
+    log.info(
+        "%s/%s: %d frames, %.2f %% of the points inside, %.3f %% self-intersecting%s",
+        entry["split"], entry["name"], entry["frames"],
+        100 * entry["inside_share"], 100 * entry["self_intersecting_share"], open_mesh,
+    )  # fmt: skip
+    if entry["inside_share"] == 0:
+        log.warning("warning: no point of %s is inside; are its meshes surfaces of a body, with faces outward?", entry["name"])
 
 
 def _versions() -> dict[str, str]:
@@ -293,15 +341,15 @@ def _report(manifest: Mapping[str, Any], frames: int, points_per_frame: int, sec
     all_frames = sum(counts.values())
     if frames:
         log.info(
-            "%d frames, %d samples in %.1f s: %.0f samples/s",
-            frames, frames * points_per_frame, seconds, frames * points_per_frame / seconds,
+            "%d frames, %d samples in %.1f s: %.1f frames/s, %.0f samples/s",
+            frames, frames * points_per_frame, seconds, frames / seconds, frames * points_per_frame / seconds,
         )  # fmt: skip
     log.info(
         "subject %s of %s data: %d train, %d test, %d ood frames, %.1f MB on disk, %.0f bytes a frame",
         manifest["subject"], manifest["data"], counts["train"], counts["test"], counts["ood"],
         manifest["bytes"] / 1e6, manifest["bytes"] / max(1, all_frames),
     )  # fmt: skip
-    if manifest["boundary_edges"] == 0:
+    if all(entry["boundary_edges"] == 0 for entry in manifest["sequences"]):
         log.info(
             "self-intersecting: winding number and ray parity label %.3f %% of the points differently",
             100 * manifest["self_intersecting_share"],

@@ -3,11 +3,13 @@
 A subject's folder `{root}/processed/{data}/{subject}` holds
 
     manifest.json                      what made it, settings, versions, counts, checksums; written last
-    subject.npz                        skeleton, faces, canonical mesh
+    subject.npz                        skeleton; mesh in the canonical pose, where the data set has one
     {train,test,ood}/{sequence}/
         points.npy       [T, P, 3]     uint16, quantised in the frame's sampling cube
         occupancies.npy  [T, P / 8]    uint8, one bit a point, most significant first
-        frames.npz                     poses, bone transforms, joints, posed vertices, cubes and boxes
+        vertices.npy     [sum V, 3]    uint16, the posed meshes' vertices, quantised likewise, one frame after the other
+        faces.npy        [sum F, 3]    int32, the faces of each topology that occurs
+        frames.npz                     poses, bone transforms, joints, cubes, boxes, where each mesh starts
         sequence.json                  settings, counts, checksums; a sequence without it does not exist
 """
 
@@ -22,17 +24,30 @@ from typing import Any
 import numpy as np
 
 from snarfcli.bodies.skeleton import Skeleton
+from snarfcli.datasets.subjects import Template
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
 from snarfcli.sampling.points import dequantise
 
-__all__ = ["FORMAT_VERSION", "SPLITS", "SampleStore", "SequenceSamples", "check_format", "file_digest", "samples_folder"]
+__all__ = [
+    "FORMAT_VERSION",
+    "SEQUENCE_FILES",
+    "SPLITS",
+    "SampleStore",
+    "SequenceSamples",
+    "check_format",
+    "file_digest",
+    "samples_folder",
+]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Rises whenever older samples could be misread."""
 
 SPLITS = ("train", "test", "ood")
 """Training motion, held-out motion of the same kind, out-of-distribution motion."""
+
+SEQUENCE_FILES = ("points.npy", "occupancies.npy", "vertices.npy", "faces.npy", "frames.npz")
+"""The files of a sequence besides its description."""
 
 _VALIDATION_SHARE = 0.1
 
@@ -69,8 +84,11 @@ class SequenceSamples:
         _check_sizes(folder, description["files"])
         self._cells = _open_array(folder / "points.npy", (self.num_frames, self.num_points, 3), np.uint16)
         self._packed = _open_array(folder / "occupancies.npy", (self.num_frames, self.num_points // 8), np.uint8)
-        self._vertices: np.ndarray | None = None
-        arrays = _read_arrays(folder / "frames.npz", leave_out="vertices")
+        arrays = _read_arrays(folder / "frames.npz")
+        self._vertex_start, self._face_start = arrays["vertex_start"], arrays["face_start"]
+        self._topology = arrays["topology"]
+        self._vertices = _open_array(folder / "vertices.npy", (int(self._vertex_start[-1]), 3), np.uint16)
+        self._faces = _open_array(folder / "faces.npy", (int(self._face_start[-1]), 3), np.int32)
         self.poses: np.ndarray = arrays["poses"]
         """[T, J, 3] float32 axis-angle, radians, global orientation included."""
         self.translation: np.ndarray = arrays["translation"]
@@ -129,10 +147,14 @@ class SequenceSamples:
         return ((self._packed[rows, index >> 3] >> (7 - (index & 7)).astype(np.uint8)) & 1).view(bool)
 
     def vertices(self, frame: int) -> np.ndarray:
-        """Return the posed mesh of one frame: [V, 3] float32, metres. The first call reads those of every frame."""
-        if self._vertices is None:
-            self._vertices = _read_arrays(self.folder / "frames.npz")["vertices"]
-        return self._vertices[frame]
+        """Return the posed mesh of one frame: [V, 3] float32, metres, right to half a step of the quantisation (0.02 mm)."""
+        cells = self._vertices[self._vertex_start[frame] : self._vertex_start[frame + 1]]
+        return dequantise(cells, self._cube_lower[frame], self._cube_size[frame])
+
+    def faces(self, frame: int) -> np.ndarray:
+        """Return the faces of one frame's mesh: [F, 3] int32, outward."""
+        topology = self._topology[frame]
+        return np.array(self._faces[self._face_start[topology] : self._face_start[topology + 1]])
 
     def box(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the tight box of one frame's posed mesh: lower [3] and upper [3], float32, metres."""
@@ -165,14 +187,12 @@ class SampleStore:
         _check_sizes(folder, manifest["files"])
         arrays = _read_arrays(folder / "subject.npz")
         self.skeleton: Skeleton = Skeleton.from_dict(arrays)
-        self.faces: np.ndarray = arrays["faces"]
-        """[F, 3] int32 triangles, outward."""
-        self.canonical_vertices: np.ndarray = arrays["vertices_canonical"]
-        """[V, 3] float32, the mesh in the canonical pose, metres."""
-        self.vertex_weights: np.ndarray = arrays["vertex_weights"]
-        """[V, J] float32 skinning weights of the body; for evaluation only, an avatar never sees them."""
+        self.template: Template | None = None
+        """The subject's mesh in the canonical pose, where the data set has one; float32."""
+        if "vertices_canonical" in arrays:
+            self.template = Template(arrays["vertices_canonical"], arrays["faces"], arrays["vertex_weights"])
         self.betas: np.ndarray = arrays["betas"]
-        """[S] float32 shape parameters of the body."""
+        """[S] float32 shape parameters of the body model; none without one."""
         self._sequences = [
             SequenceSamples(folder / entry["split"] / entry["name"], entry) for entry in manifest["sequences"]
         ]
@@ -278,10 +298,10 @@ def _open_array(path: Path, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     return array
 
 
-def _read_arrays(path: Path, leave_out: str = "") -> dict[str, np.ndarray]:
-    """Read an archive of ours, except for one big array that is not always needed."""
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read an archive of ours."""
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files if key != leave_out}
+            return {key: archive[key] for key in archive.files}
     except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"the samples are damaged: {path} cannot be read ({error}); {_again(path.parent)}") from None

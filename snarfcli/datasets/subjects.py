@@ -1,127 +1,86 @@
-"""The built-in subject set: ten people with DFaust's ids, each with a shape and a way of moving of their own."""
+"""What a data set says about a subject: skeleton, sequences, and where the posed meshes come from."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from snarfcli.bodies import Body, Skeleton, builtin_body
-from snarfcli.errors import UserError, nearest
-from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, Motion, builtin_motion
+from snarfcli.bodies import Body, Skeleton
+from snarfcli.datasets.posed_meshes import BodyMeshes, PosedMeshes
+from snarfcli.motions import Motion
 
-__all__ = ["BUILTIN_SUBJECTS", "HELD_OUT_SEQUENCES", "SequenceSpec", "SubjectData", "builtin_subject", "check_subject"]
+__all__ = ["SequenceSpec", "Split", "SubjectData", "Template", "body_sequence", "body_template"]
 
 Split = Literal["train", "test", "ood"]
 
-HELD_OUT_SEQUENCES = {
-    "50002": "chicken_wings",
-    "50004": "hips",
-    "50007": "jiggle_on_toes",
-    "50009": "jumping_jacks",
-    "50020": "knees",
-    "50021": "light_hopping_stiff",
-    "50022": "light_hopping_loose",
-    "50025": "one_leg_jump",
-    "50026": "one_leg_loose",
-    "50027": "punching",
-}
-"""The sequence of each subject that is kept for testing, as in the split of SNARF and Fast-SNARF."""
 
-BUILTIN_SUBJECTS = tuple(HELD_OUT_SEQUENCES)
-"""Ids of the built-in subjects, which are DFaust's."""
-
-_SEQUENCES_PER_SUBJECT = 10
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SequenceSpec:
-    """One motion of a subject and what it is for."""
+    """One sequence of a subject and what it is for."""
 
     name: str
-    """Name of the sequence."""
+    """Name of the sequence, which is also a folder's."""
     split: Split
     """`train` (its last part is for validation), `test` (held out), or `ood` (out of distribution)."""
     motion: Motion
-    """Poses, y up, at the rate of the recording."""
+    """Poses, translation and frame rate of the recording."""
+    meshes: PosedMeshes
+    """The posed mesh of every frame of the motion."""
+    posed_from_rest: NDArray[np.float64] | None = None
+    """[T, J, 4, 4] bone transforms, metres, where the poses alone do not give them (joints that move or stretch)."""
+    frames: NDArray[np.int64] | None = None
+    """Numbers of the frames to use, where the data set has chosen them; else every so many as the settings say."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Template:
+    """A mesh of the subject in the canonical pose; for looking at and for evaluation, an avatar never sees it."""
+
+    vertices: NDArray
+    """[V, 3] metres."""
+    faces: NDArray
+    """[F, 3] vertex numbers, outward."""
+    weights: NDArray
+    """[V, J] skinning weights that the posed meshes were made with, rows sum to 1."""
+
+
+@dataclass(frozen=True, eq=False)
 class SubjectData:
-    """A person: a body, a shape and motions."""
+    """A subject: a skeleton and posed meshes in sequences."""
 
     data: str
-    """Which data this is; `builtin` here."""
+    """Name of the data set."""
     subject: str
     """The subject's id."""
-    body: Body
-    """The body model."""
-    betas: NDArray[np.float64]
-    """[S] shape parameters."""
     skeleton: Skeleton
-    """Joints of this shape and the canonical pose."""
+    """Joints of this subject and the canonical pose."""
     sequences: tuple[SequenceSpec, ...]
     """Training, test and out-of-distribution sequences, in this order."""
+    template: Template | None = None
+    """The subject's mesh in the canonical pose, where the data set has one."""
+    betas: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    """[S] shape parameters of the body model; none without one."""
+    sources: tuple[str, ...] = ()
+    """What the subject was made from, such as the body's file: printed, and written to the manifest."""
+    broken: tuple[tuple[str, str], ...] = ()
+    """Sequences that cannot be used, and why."""
 
     def of_split(self, split: Split) -> tuple[SequenceSpec, ...]:
         """Return the sequences of one split."""
         return tuple(sequence for sequence in self.sequences if sequence.split == split)
 
 
-def _betas(subject: str, count: int) -> NDArray[np.float64]:
-    # Standard normal is what the shape space is scaled to; 0.9 and the clip keep everyone an ordinary adult.
-    return np.clip(0.9 * np.random.default_rng([int(subject), 1]).standard_normal(count), -2.0, 2.0)
+def body_template(body: Body, betas: NDArray[np.float64], skeleton: Skeleton) -> Template:
+    """Return the mesh of a body model in the skeleton's canonical pose."""
+    body = body.to(torch.float64)
+    vertices = body.pose(skeleton.canonical_pose[None], betas).vertices[0]
+    return Template(vertices.numpy(), body.faces.numpy().astype(np.int32), body.weights.numpy())
 
 
-def _leg_length(body: Body, betas: NDArray[np.float64] | None) -> float:
-    """Return the height of the pelvis above the soles in the rest pose, metres."""
-    vertices, joints = body.shaped(betas)
-    return float(joints[0, 1] - vertices[:, 1].min())
-
-
-def _sequence_names(subject: str) -> tuple[str, ...]:
-    """Return the subject's ten sequences in TRAINING_SEQUENCES' order, the held-out one among them."""
-    held_out = HELD_OUT_SEQUENCES[subject]
-    others = [name for name in TRAINING_SEQUENCES if name != held_out]
-    chosen = np.random.default_rng([int(subject), 2]).permutation(others)[: _SEQUENCES_PER_SUBJECT - 1]
-    return tuple(name for name in TRAINING_SEQUENCES if name == held_out or name in chosen)
-
-
-def check_subject(subject: str) -> None:
-    """Refuse an id that is none of `BUILTIN_SUBJECTS`, with the nearest one.
-
-    Raises:
-        UserError: it is none.
-    """
-    if subject not in HELD_OUT_SEQUENCES:
-        hint = nearest(subject, BUILTIN_SUBJECTS) or "."
-        raise UserError(f"no built-in subject '{subject}'{hint} Known are {', '.join(BUILTIN_SUBJECTS)}")
-
-
-def builtin_subject(subject: str | int) -> SubjectData:
-    """Make one of the built-in subjects: always the same one for the same id.
-
-    Args:
-        subject: one of `BUILTIN_SUBJECTS`.
-
-    Raises:
-        UserError: there is no such subject; the message names the nearest valid id.
-    """
-    subject = str(subject)
-    check_subject(subject)
-    body = builtin_body()
-    betas = _betas(subject, body.num_betas)
-    held_out = HELD_OUT_SEQUENCES[subject]
-    names = _sequence_names(subject)
-    splits: list[tuple[str, Split]] = [(name, "train") for name in names if name != held_out]
-    splits += [(held_out, "test"), *((name, "ood") for name in OUT_OF_DISTRIBUTION_SEQUENCES)]
-    size = _leg_length(body, betas) / _leg_length(body, None)
-    sequences = []
-    for name, split in splits:
-        motion = builtin_motion(name, int(subject))
-        # Steps and hops grow with the legs, so that this person's feet stay on this person's floor.
-        motion = replace(motion, translation=motion.translation * size)
-        sequences.append(SequenceSpec(name, split, motion))
-    return SubjectData("builtin", subject, body, betas, body.skeleton(betas), tuple(sequences))
+def body_sequence(name: str, split: Split, motion: Motion, body: Body, betas: NDArray[np.float64]) -> SequenceSpec:
+    """Return a sequence whose meshes are those of a body model in the poses of a motion."""
+    return SequenceSpec(name, split, motion, BodyMeshes(body, betas, motion.poses, motion.translation))

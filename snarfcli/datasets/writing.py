@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from snarfcli.datasets.store import FORMAT_VERSION, SPLITS, check_format, file_digest
+from snarfcli.datasets.store import FORMAT_VERSION, SEQUENCE_FILES, SPLITS, check_format, file_digest
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, read_json, write_json
 from snarfcli.sampling.points import FrameSamples
@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 _PARTIAL = ".partial"
+_SPOOL = "vertices.spool"
 
 
 def settings_digest(settings: Mapping[str, Any]) -> str:
@@ -63,42 +64,70 @@ class SequenceWriter:
         shutil.rmtree(self._partial, ignore_errors=True)
         self._partial.mkdir(parents=True)
         self._shape = (num_frames, num_points)
-        self._cube_lower = np.zeros((num_frames, 3), np.float32)
-        self._cube_size = np.zeros(num_frames, np.float32)
-        self._inside = self._differing = 0
-        self._points = self._occupancies = None
+        self._cubes = np.zeros((num_frames, 4), np.float32)
+        self._boxes = np.zeros((num_frames, 2, 3), np.float32)
+        self._inside = self._differing = self._boundary_edges = 0
+        self._topologies: list[np.ndarray] = []
+        self._topology = np.zeros(num_frames, np.int64)
+        self._spooled = np.zeros((num_frames, 2), np.int64)  # of each frame's vertices: first one and number in the spool
+        self._points = self._occupancies = self._spool = None
         try:
             self._points, self._points_start = _start_array(self._partial / "points.npy", (*self._shape, 3), "<u2")
             packed = (num_frames, num_points // 8)
             self._occupancies, self._bits_start = _start_array(self._partial / "occupancies.npy", packed, "|u1")
+            self._spool = open(self._partial / _SPOOL, "w+b")  # noqa: SIM115  closed by finish or discard
         except BaseException:
             self.discard()
             raise
 
     def write_frame(self, frame: int, samples: FrameSamples) -> None:
-        """Write the points and labels of frame number `frame` of this sequence."""
+        """Write the points, the labels and the mesh of frame number `frame` of this sequence."""
         num_points = self._shape[1]
         # plain writes, not a memory map: a full disk is then an error that can be reported, not a bus error
         self._points.seek(self._points_start + frame * num_points * 6)
         self._points.write(np.ascontiguousarray(samples.points, "<u2").data)
         self._occupancies.seek(self._bits_start + frame * (num_points // 8))
         self._occupancies.write(np.packbits(samples.occupied).data)
-        self._cube_lower[frame], self._cube_size[frame] = samples.cube_lower, samples.cube_size
+        # how many vertices the frames before this one have is not known yet, so they are put in order by `finish`
+        self._spooled[frame] = self._spool.tell() // 6, len(samples.vertices)
+        self._spool.write(np.ascontiguousarray(samples.vertices, "<u2").data)
+        self._topology[frame] = self._topology_of(samples.faces)
+        self._cubes[frame, :3], self._cubes[frame, 3] = samples.cube_lower, samples.cube_size
+        self._boxes[frame] = samples.box_lower, samples.box_upper
         self._inside += int(samples.occupied.sum())
         self._differing += samples.differing
+        self._boundary_edges = max(self._boundary_edges, samples.boundary_edges)
+
+    def _topology_of(self, faces: np.ndarray) -> int:
+        """Return the number of a list of faces among those seen so far, the last ones first."""
+        for number in reversed(range(len(self._topologies))):
+            if np.array_equal(self._topologies[number], faces):
+                return number
+        self._topologies.append(faces)
+        return len(self._topologies) - 1
 
     def finish(self, arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> dict[str, Any]:
         """Complete the sequence once every frame is written, and return what its `sequence.json` says.
 
         Args:
-            arrays: what `frames.npz` holds besides the cubes, [T, ...] each.
+            arrays: what `frames.npz` holds besides cubes, boxes and where each mesh starts, [T, ...] each.
             description: entries of `sequence.json` besides counts, shares and checksums; `settings` among them.
         """
         self._points.close()
         self._occupancies.close()
-        write_arrays(
-            self._partial / "frames.npz", {**arrays, "cube_lower": self._cube_lower, "cube_size": self._cube_size}
-        )
+        vertex_start = self._write_vertices()
+        seen, topology = np.unique(self._topology, return_inverse=True)
+        order = np.argsort([int(np.argmax(self._topology == number)) for number in seen])  # by the first frame that has it
+        faces = [self._topologies[seen[number]] for number in order]
+        np.save(self._partial / "faces.npy", np.concatenate(faces).astype("<i4"))
+        meshes = {
+            "vertex_start": vertex_start,
+            "face_start": np.cumsum([0, *(len(part) for part in faces)]),
+            "topology": np.argsort(order)[topology],
+        }
+        cubes = {"cube_lower": self._cubes[:, :3], "cube_size": self._cubes[:, 3]}
+        boxes = {"box_lower": self._boxes[:, 0], "box_upper": self._boxes[:, 1]}
+        write_arrays(self._partial / "frames.npz", {**arrays, **cubes, **boxes, **meshes})
         frames, num_points = self._shape
         complete = {
             "format_version": FORMAT_VERSION,
@@ -108,7 +137,8 @@ class SequenceWriter:
             "points_per_frame": num_points,
             "inside_share": self._inside / (frames * num_points),
             "self_intersecting_share": self._differing / (frames * num_points),
-            "files": describe_files(self._partial, ("points.npy", "occupancies.npy", "frames.npz")),
+            "boundary_edges": self._boundary_edges,
+            "files": describe_files(self._partial, SEQUENCE_FILES),
         }
         write_json(self._partial / "sequence.json", complete)
         if self.folder.exists():
@@ -116,9 +146,21 @@ class SequenceWriter:
         os.replace(self._partial, self.folder)
         return complete
 
+    def _write_vertices(self) -> np.ndarray:
+        """Write the spooled vertices in the order of the frames; return where each frame's start, [T + 1]."""
+        starts = np.concatenate([[0], np.cumsum(self._spooled[:, 1])])
+        file, _ = _start_array(self._partial / "vertices.npy", (int(starts[-1]), 3), "<u2")
+        with file:
+            for first, count in self._spooled:
+                self._spool.seek(int(first) * 6)
+                file.write(self._spool.read(int(count) * 6))
+        self._spool.close()
+        (self._partial / _SPOOL).unlink()
+        return starts
+
     def discard(self) -> None:
         """Leave nothing of an unfinished sequence behind; harmless after `finish`."""
-        for file in (self._points, self._occupancies):
+        for file in (self._points, self._occupancies, self._spool):
             if file is not None:
                 with contextlib.suppress(OSError):  # a full disk shows again when the buffer is flushed
                     file.close()

@@ -54,6 +54,8 @@ class Samples(Protocol):
 
     def vertices(self, frame: int) -> np.ndarray: ...
 
+    def faces(self, frame: int) -> np.ndarray: ...
+
 
 def choose_frames(sequences: Sequence[Samples], max_frames: int | None = None) -> list[tuple[Samples, int]]:
     """Return pairs of a sequence and the index of a frame: all, or `max_frames` evenly spaced over all sequences.

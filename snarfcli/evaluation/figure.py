@@ -58,7 +58,6 @@ def choose_extremes(frames: Sequence[FrameMetrics], count: int) -> tuple[list[Fr
 def write_figure(
     path: str | Path,
     avatar: Avatar,
-    faces: np.ndarray,
     sequences: Sequence[Samples],
     frames: Sequence[FrameMetrics],
     *,
@@ -71,7 +70,6 @@ def write_figure(
     Args:
         path: where to.
         avatar: the avatar that was measured.
-        faces: [F, 3] of the ground truth.
         sequences: samples; their names are those in `frames`.
         frames: what was measured.
         count: how many of either.
@@ -86,9 +84,7 @@ def write_figure(
     captions: list[list[str | None]] = [[] for _ in worst]
     chosen = [(row, frame) for group in (worst, best) for row, frame in enumerate(group)]
     for row, frame in progress(chosen, desc="drawing", unit="frames"):
-        pictures, (missing, extra) = draw_frame(
-            avatar, faces, by_name[frame.sequence], frame.index, resolution=resolution
-        )
+        pictures, (missing, extra) = draw_frame(avatar, by_name[frame.sequence], frame.index, resolution=resolution)
         rows[row] += pictures
         captions[row] += [
             f"{frame.sequence}, frame {frame.frame}",
@@ -105,13 +101,12 @@ def write_figure(
 
 
 def draw_frame(
-    avatar: Avatar, faces: np.ndarray, sequence: Samples, index: int, *, resolution: int, size: int = _PANEL
+    avatar: Avatar, sequence: Samples, index: int, *, resolution: int, size: int = _PANEL
 ) -> tuple[list[np.ndarray | None], tuple[int, int]]:
     """Draw one frame from one camera: ground truth, prediction, and the points whose label was predicted wrong.
 
     Args:
         avatar: the predicting avatar.
-        faces: [F, 3] of the ground truth.
         sequence: samples.
         index: frame.
         resolution: voxels along the longest side of the predicted mesh.
@@ -126,7 +121,7 @@ def draw_frame(
     from snarfcli.meshing.mesh import Mesh
     from snarfcli.meshing.surfaces import field_surface
 
-    truth = Mesh(sequence.vertices(index), faces)
+    truth = Mesh(sequence.vertices(index), sequence.faces(index))
     camera = Camera.framing(truth.vertices)
     floor_y = float(truth.vertices[:, 1].min())
     pose, translation = (torch.as_tensor(values[index]) for values in (sequence.poses, sequence.translation))

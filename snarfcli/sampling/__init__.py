@@ -12,6 +12,7 @@ from snarfcli.sampling.occupancy import (
 from snarfcli.sampling.parallel import count_cores, run_in_processes
 from snarfcli.sampling.points import (
     CUBE_PADDING,
+    BrokenFrame,
     FrameSamples,
     SamplingSettings,
     dequantise,
@@ -26,6 +27,7 @@ from snarfcli.sampling.points import (
 __all__ = [
     "CUBE_PADDING",
     "INSIDE_TESTS",
+    "BrokenFrame",
     "FrameSamples",
     "SamplingSettings",
     "check_mesh",

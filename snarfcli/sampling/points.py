@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from snarfcli.errors import UserError, nearest
-from snarfcli.sampling.occupancy import INSIDE_TESTS, labels_differ, ray_parity, winding_numbers
+from snarfcli.sampling.occupancy import INSIDE_TESTS, check_mesh, labels_differ, ray_parity, winding_numbers
 
 __all__ = [
     "CUBE_PADDING",
+    "BrokenFrame",
     "FrameSamples",
     "SamplingSettings",
     "dequantise",
@@ -65,18 +67,44 @@ class SamplingSettings:
 
 @dataclass(frozen=True)
 class FrameSamples:
-    """Labelled points of one posed mesh."""
+    """Labelled points of one posed mesh, and the mesh itself."""
 
     points: np.ndarray
     """[P, 3] uint16, quantised in the cube; first half uniform, second half near the surface."""
     occupied: np.ndarray
     """[P] bool, labels of the quantised points."""
+    vertices: np.ndarray
+    """[V, 3] uint16, the mesh's vertices quantised in the cube."""
+    faces: np.ndarray
+    """[F, 3] int32."""
     cube_lower: np.ndarray
     """[3] float32, the cube's corner, metres."""
     cube_size: np.float32
     """The cube's side, metres."""
+    box_lower: np.ndarray
+    """[3] float32, lower corner of the mesh's tight box, metres."""
+    box_upper: np.ndarray
+    """[3] float32, upper corner of the mesh's tight box, metres."""
+    boundary_edges: int
+    """Number of edges at which the mesh is open."""
     differing: int
     """Number of points that the other inside test would label differently (closed meshes; 0 for open ones)."""
+
+
+@dataclass(frozen=True)
+class BrokenFrame:
+    """What comes instead of the samples of a frame that cannot be used; the frames after it are not looked at."""
+
+    message: str
+    """One line: which mesh, what is wrong, what to do."""
+
+
+class Meshes(Protocol):
+    """Posed meshes: vertices [V, 3], metres, and outward faces [F, 3]."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 def frame_generator(seed: int, *names: str | int) -> np.random.Generator:
@@ -168,7 +196,7 @@ def sample_frame(
     settings: SamplingSettings,
     generator: np.random.Generator,
     *,
-    is_closed: bool = True,
+    boundary_edges: int = 0,
 ) -> FrameSamples:
     """Sample labelled points of one posed mesh (SNARF section 4.1; the cube is its released code's).
 
@@ -177,7 +205,7 @@ def sample_frame(
         faces: [F, 3] vertex numbers, outward.
         settings: how many points, and how they are chosen and labelled.
         generator: from `frame_generator`.
-        is_closed: the mesh has no boundary, so that both inside tests can be compared.
+        boundary_edges: of the mesh; 0 says that it is closed, so that both inside tests can be compared.
     """
     count = settings.points_per_frame
     cube_lower, cube_size = sampling_cube(vertices, settings.padding)
@@ -188,29 +216,46 @@ def sample_frame(
     points = dequantise(cells, cube_lower, cube_size)
     winding = winding_numbers(vertices, faces, points)
     by_parity = settings.inside_test == "parity"
-    occupied = ray_parity(vertices, faces, points) if by_parity else winding > 0.5
-    differing = int(labels_differ(winding).sum()) if is_closed else 0
-    return FrameSamples(cells, occupied, cube_lower, cube_size, differing)
+    return FrameSamples(
+        points=cells,
+        occupied=ray_parity(vertices, faces, points) if by_parity else winding > 0.5,
+        vertices=quantise(vertices, cube_lower, cube_size),
+        faces=faces.astype(np.int32),
+        cube_lower=cube_lower,
+        cube_size=cube_size,
+        box_lower=vertices.min(axis=0).astype(np.float32),
+        box_upper=vertices.max(axis=0).astype(np.float32),
+        boundary_edges=boundary_edges,
+        differing=int(labels_differ(winding).sum()) if boundary_edges == 0 else 0,
+    )
 
 
 def sample_frames(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    settings: SamplingSettings,
-    names: Sequence[str],
-    frames: Sequence[int],
-    is_closed: bool = True,
-) -> Iterator[FrameSamples]:
+    meshes: Meshes, settings: SamplingSettings, names: Sequence[str], frames: Sequence[int]
+) -> Iterator[FrameSamples | BrokenFrame]:
     """Sample one posed mesh after another; the random numbers of each depend on its own names and frame number.
 
     Args:
-        vertices: [T, V, 3] metres.
-        faces: [F, 3] vertex numbers, outward.
+        meshes: T meshes.
         settings: see `sample_frame`.
         names: what tells this sequence from others, such as subject and sequence name.
         frames: [T] frame numbers within the sequence.
-        is_closed: see `sample_frame`.
+
+    Yields:
+        The samples of each frame, or what is wrong with the first one that cannot be used.
     """
-    for posed, frame in zip(vertices, frames, strict=True):
-        generator = frame_generator(settings.seed, *names, int(frame))
-        yield sample_frame(posed, faces, settings, generator, is_closed=is_closed)
+    checked: np.ndarray | None = None
+    for index, frame in enumerate(frames):
+        try:
+            vertices, faces = meshes[index]
+            if checked is None or faces is not checked:
+                boundary_edges = check_mesh(vertices, faces, settings.inside_test, f"{names[-1]}, frame {frame}: the mesh")
+                checked = faces
+            elif not np.isfinite(vertices).all():
+                raise UserError(f"{names[-1]}, frame {frame}: the mesh has NaN or infinite vertices; repair its pose first")
+            generator = frame_generator(settings.seed, *names, int(frame))
+            samples = sample_frame(vertices, faces, settings, generator, boundary_edges=boundary_edges)
+        except UserError as error:
+            yield BrokenFrame(str(error))
+            return
+        yield samples

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from toy_subject import toy_subject
+from toy_subject import toy_body, toy_subject
 
 from snarfcli.commands import preprocess
 from snarfcli.commands.preprocess import PreprocessConfig
+from snarfcli.datasets.posed_meshes import PosedMeshes
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.store import SampleStore
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.datasets.writing import SequenceWriter
@@ -29,13 +31,12 @@ def subject(monkeypatch: pytest.MonkeyPatch) -> list[SubjectData]:
     """Make the toy the only subject; a test may put another in its place."""
     holder = [toy_subject()]
 
-    def load(name: str) -> SubjectData:
+    def load(name: str, request: Request) -> SubjectData:
         if name != "toy":
             raise UserError(f"no built-in subject '{name}'")
         return holder[0]
 
-    monkeypatch.setattr("snarfcli.datasets.subjects.BUILTIN_SUBJECTS", ("toy",))
-    monkeypatch.setattr("snarfcli.datasets.subjects.builtin_subject", load)
+    monkeypatch.setattr("snarfcli.datasets.builtin.load", load)
     return holder
 
 
@@ -43,7 +44,7 @@ def _config(root: Path, **changes: Any) -> PreprocessConfig:
     return PreprocessConfig(**{
         "subject": "toy", "data": DataConfig("builtin", 1, 1, 1), "data_root": str(root), "points_per_frame": 400,
         "surface_noise_m": 0.01, "padding": 0.1, "inside_test": "winding", "workers": 2, "seed": 0, "overwrite": False,
-        "sequences": [], **changes,
+        "sequences": [], "skip_broken": False, "body": None, **changes,
     })  # fmt: skip
 
 
@@ -74,12 +75,16 @@ def test_samples_do_not_depend_on_workers_or_interruptions(
     assert len({bend.points(frame).tobytes() for frame in range(34)}) == 34
     for frame in (0, 30, 33):
         points = bend.points(frame)
-        np.testing.assert_array_equal(bend.occupancies(frame), occupancies(bend.vertices(frame), store.faces, points))
-        np.testing.assert_allclose(bend.box(frame)[0], bend.vertices(frame).min(0))
+        mesh = subject[0].sequences[0].meshes[frame]
+        np.testing.assert_array_equal(bend.faces(frame), mesh[1])
+        np.testing.assert_array_equal(bend.occupancies(frame), occupancies(*mesh, points))
+        np.testing.assert_array_equal(bend.box(frame)[0], mesh[0].min(0))
+        lower, upper = bend.cube(frame)
+        assert np.abs(bend.vertices(frame) - mesh[0]).max() <= 0.51 * (upper - lower).max() / 65536  # half a step
     # the bone transforms move the canonical mesh and joints onto the posed ones
-    weights, canonical = store.vertex_weights, np.pad(store.canonical_vertices, ((0, 0), (0, 1)), constant_values=1)
+    weights, canonical = store.template.weights, np.pad(store.template.vertices, ((0, 0), (0, 1)), constant_values=1)
     posed = np.einsum("vj,tjrc,vc->tvr", weights, bend.bone_transforms[:, :, :3], canonical)
-    np.testing.assert_allclose(posed[8], bend.vertices(8), atol=2e-6)  # fp32 transforms of 1 m
+    np.testing.assert_allclose(posed[8], subject[0].sequences[0].meshes[8][0], atol=2e-6)  # fp32 transforms of 1 m
     joints = torch.cat([store.skeleton.canonical_joints, torch.ones(2, 1)], 1).numpy()
     moved = np.einsum("tjrc,jc->tjr", bend.bone_transforms[:, :, :3], joints)
     np.testing.assert_allclose(moved, bend.joints, atol=2e-6)
@@ -101,8 +106,8 @@ def test_settings_are_not_mixed(tmp_path: Path, subject: list[SubjectData]) -> N
     subject[0].sequences[2].motion.poses[0, 1, 0] += 0.1
     with pytest.raises(UserError, match=r"fold was made from another motion \(poses differs\)"):
         preprocess.run(_config(tmp_path, **few))
-    body = replace(subject[0].body, v_template=subject[0].body.v_template * 1.1)
-    subject[0] = replace(subject[0], body=body)
+    body = toy_body()
+    subject[0] = toy_subject(body=replace(body, v_template=body.v_template * 1.1))
     with pytest.raises(UserError, match="made from another body"):
         preprocess.run(_config(tmp_path, **few))
     assert _contents(tmp_path) == before
@@ -148,12 +153,12 @@ def test_a_damaged_sequence_is_made_again(tmp_path: Path, subject: list[SubjectD
 def test_an_open_mesh_is_said_once(
     tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture
 ) -> None:
-    body = subject[0].body
-    subject[0] = replace(subject[0], body=replace(body, faces=body.faces[1:]))
+    body = toy_body()
+    subject[0] = toy_subject(body=replace(body, faces=body.faces[1:]))
     few = {"sequences": ["fold"], "workers": 1}
     preprocess.run(_config(tmp_path, **few))
     assert caplog.text.count("is open, 3 boundary edges: labelled by winding number") == 1
-    assert SampleStore.open(tmp_path, "builtin", "toy").manifest["boundary_edges"] == 3
+    assert SampleStore.open(tmp_path, "builtin", "toy").manifest["sequences"][0]["boundary_edges"] == 3
     with pytest.raises(UserError, match=r"is open \(3 boundary edges\).*inside_test=winding"):
         preprocess.run(_config(tmp_path / "other", inside_test="parity", **few))
     assert not _contents(tmp_path / "other")
@@ -179,7 +184,7 @@ def test_bad_values_make_nothing(tmp_path: Path, subject: list[SubjectData], cha
 
 def test_bad_poses_are_named(tmp_path: Path, subject: list[SubjectData]) -> None:
     subject[0].sequences[1].motion.poses[2, 0, 1] = np.nan
-    with pytest.raises(UserError, match="wave has NaN or infinite vertices in frame 2"):
+    with pytest.raises(UserError, match="wave has NaN or infinite poses in frame 2"):
         preprocess.run(_config(tmp_path, sequences=["wave"]))
     assert not _contents(tmp_path)
 
@@ -188,3 +193,50 @@ def test_a_folder_that_cannot_be_made_is_an_os_error(tmp_path: Path, subject: li
     (tmp_path / "processed").write_text("a file in the way")
     with pytest.raises(OSError):
         preprocess.run(_config(tmp_path))
+
+
+class _FailsAt:
+    """Meshes of which one cannot be read, as when a file is damaged."""
+
+    def __init__(self, meshes: PosedMeshes, bad: int) -> None:
+        self.meshes, self.bad, self.frames = meshes, bad, np.arange(len(meshes))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        if self.frames[index] == self.bad:
+            raise UserError(f"mesh {self.bad:06d}.obj is damaged")
+        return self.meshes[self.frames[index]]
+
+    def chosen(self, frames: np.ndarray) -> _FailsAt:
+        part = _FailsAt(self.meshes, self.bad)
+        part.frames = frames
+        return part
+
+    def fingerprint(self) -> str:
+        return ""
+
+
+def test_a_broken_sequence_stops_the_run_or_is_left_out(
+    tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture
+) -> None:
+    train, wave, fold = subject[0].sequences
+    broken = replace(train, meshes=_FailsAt(train.meshes, 31))  # in the second task of the sequence
+    subject[0] = replace(subject[0], sequences=(wave, broken, fold), broken=(("lost", "lost.npz is truncated"),))
+    with pytest.raises(UserError, match=r"sequence lost cannot be used: lost.npz is truncated; give skip_broken=true"):
+        preprocess.run(_config(tmp_path))
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(UserError, match=r"mesh 000031.obj is damaged; give skip_broken=true"):
+        preprocess.run(_config(tmp_path, sequences=["wave", "bend"], workers=1))
+    assert {name.split("/")[1] for name in _contents(tmp_path) if "/" in name} == {"wave"}  # what was complete stays
+    preprocess.run(_config(tmp_path, skip_broken=True))
+    store = SampleStore.open(tmp_path, "builtin", "toy")
+    assert [(entry["split"], entry["name"]) for entry in store.manifest["sequences"]] == [("test", "wave"), ("ood", "fold")]
+    assert store.manifest["skipped"] == [
+        {"name": "lost", "reason": "lost.npz is truncated"},
+        {"name": "bend", "reason": "mesh 000031.obj is damaged"},
+    ]
+    assert "left out: sequence lost (lost.npz is truncated)" in caplog.text
+    assert "left out: sequence bend (mesh 000031.obj is damaged)" in caplog.text
+    assert not list(tmp_path.rglob(".*"))

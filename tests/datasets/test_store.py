@@ -30,14 +30,25 @@ def _frame(seed: int) -> FrameSamples:
     generator = np.random.default_rng(seed)
     cells = generator.integers(0, 65536, (_POINTS, 3)).astype(np.uint16)
     lower = generator.normal(size=3).astype(np.float32)
-    return FrameSamples(cells, generator.random(_POINTS) < 0.3, lower, np.float32(1 + seed), differing=seed % 2)
+    corners = 4 + seed % 3 if seed % 2 else 4  # some frames have a mesh of their own
+    return FrameSamples(
+        points=cells,
+        occupied=generator.random(_POINTS) < 0.3,
+        vertices=generator.integers(0, 65536, (corners, 3)).astype(np.uint16),
+        faces=np.arange(3 * corners, dtype=np.int32).reshape(-1, 3) % corners,
+        cube_lower=lower,
+        cube_size=np.float32(1 + seed),
+        box_lower=lower,
+        box_upper=lower + np.float32(seed),
+        boundary_edges=corners - 4,
+        differing=seed % 2,
+    )
 
 
 def _arrays(frames: int) -> dict[str, np.ndarray]:
     generator = np.random.default_rng(frames)
     shapes = {
-        "poses": (2, 3), "translation": (3,), "posed_from_canonical": (2, 4, 4), "joints": (2, 3), "vertices": (5, 3),
-        "box_lower": (3,), "box_upper": (3,),
+        "poses": (2, 3), "translation": (3,), "posed_from_canonical": (2, 4, 4), "joints": (2, 3),
     }  # fmt: skip
     arrays = {name: generator.normal(size=(frames, *shape)).astype(np.float32) for name, shape in shapes.items()}
     return {**arrays, "frame_numbers": np.arange(frames) * 4}
@@ -112,11 +123,17 @@ def test_the_rest_comes_back(folder: Path) -> None:
     np.testing.assert_array_equal(walk.poses, arrays["poses"])
     np.testing.assert_array_equal(walk.bone_transforms, arrays["posed_from_canonical"])
     np.testing.assert_array_equal(walk.joints, arrays["joints"])
-    np.testing.assert_array_equal(walk.vertices(4), arrays["vertices"][4])
-    np.testing.assert_array_equal(walk.box(4)[1], arrays["box_upper"][4])
+    for frame in (0, 1, 4, 5, 19):
+        made = _frame(frame)
+        wanted = dequantise(made.vertices, made.cube_lower, made.cube_size)
+        np.testing.assert_array_equal(walk.vertices(frame), wanted)
+        np.testing.assert_array_equal(walk.faces(frame), made.faces)
+        np.testing.assert_array_equal(walk.box(frame), (made.box_lower, made.box_upper))
+    assert walk.description["boundary_edges"] == 2
+    assert np.load(folder / "train" / "walk" / "faces.npy").shape == (4 + 5 + 6, 3)  # each topology once
     assert store.skeleton.names == ("root", "middle") and store.skeleton.parents == (-1, 0)
-    assert store.faces.shape == (4, 3) and store.canonical_vertices.shape == (5, 3)
-    assert store.vertex_weights.shape == (5, 2)
+    assert store.template.faces.shape == (4, 3) and store.template.vertices.shape == (5, 3)
+    assert store.template.weights.shape == (5, 2)
     assert [sequence.name for sequence in store.sequences("test")] == ["hop"]
 
 

@@ -54,10 +54,13 @@ class Capsule:
         self.translation = np.zeros((1, 3), np.float32)
         self.bone_transforms = np.tile(np.eye(4, dtype=np.float32), (1, avatar.skeleton.num_joints, 1, 1))
         self.frame_numbers = np.array([0])
-        self.surface, self.faces = capsule_mesh(self.length, RADIUS)
+        self.surface, self.triangles = capsule_mesh(self.length, RADIUS)
 
     def vertices(self, index):
         return self.surface.astype(np.float32)
+
+    def faces(self, index):
+        return self.triangles
 
     def points(self, index, chosen=None):
         return np.random.default_rng(0).uniform((-0.1, -0.2, -0.2), (1.6, 0.2, 0.2), (2000, 3)).astype(np.float32)
@@ -76,7 +79,7 @@ def count(picture: np.ndarray, color: tuple[int, int, int]) -> int:
 
 def test_the_right_capsule_has_no_wrong_points():
     sequence = Capsule()
-    (truth, predicted, points), wrong = draw_frame(ToyAvatar(), sequence.faces, sequence, 0, resolution=32, size=96)
+    (truth, predicted, points), wrong = draw_frame(ToyAvatar(), sequence, 0, resolution=32, size=96)
     assert wrong == (0, 0)
     assert count(points, MISSING) == count(points, EXTRA) == 0
     # the same shape from the same camera, up to the voxels
@@ -86,12 +89,12 @@ def test_the_right_capsule_has_no_wrong_points():
 
 def test_missing_and_extra_points_have_their_colours():
     longer, shorter = Capsule(0.4), Capsule(-0.4)
-    (_, _, points), (missing, extra) = draw_frame(ToyAvatar(), longer.faces, longer, 0, resolution=32, size=96)
+    (_, _, points), (missing, extra) = draw_frame(ToyAvatar(), longer, 0, resolution=32, size=96)
     assert missing > 20
     assert extra == 0
     assert count(points, MISSING) > 20
     assert count(points, EXTRA) == 0
-    (_, _, points), (missing, extra) = draw_frame(ToyAvatar(), shorter.faces, shorter, 0, resolution=32, size=96)
+    (_, _, points), (missing, extra) = draw_frame(ToyAvatar(), shorter, 0, resolution=32, size=96)
     assert missing == 0
     assert extra > 20
     assert count(points, EXTRA) > 0
@@ -100,9 +103,9 @@ def test_missing_and_extra_points_have_their_colours():
 def test_an_empty_field_leaves_its_place_empty(tmp_path, caplog):
     sequence = Capsule()
     avatar = ToyAvatar(radius=-1.0)
-    pictures, (missing, extra) = draw_frame(avatar, sequence.faces, sequence, 0, resolution=32, size=64)
+    pictures, (missing, extra) = draw_frame(avatar, sequence, 0, resolution=32, size=64)
     assert pictures[1] is None
     assert (missing, extra) == (sequence.occupancies(0).sum(), 0)
     assert "nothing to draw for lie, frame 0" in caplog.text
-    write_figure(tmp_path / "frames.png", avatar, sequence.faces, [sequence], [frame("lie", 0, 0.0)], resolution=32)
+    write_figure(tmp_path / "frames.png", avatar, [sequence], [frame("lie", 0, 0.0)], resolution=32)
     assert [path.name for path in tmp_path.iterdir()] == ["frames.png"]

@@ -44,7 +44,7 @@ def config_for(store, tmp_path, caplog):
         if name == "preset":
             skinning.weights_file = str(tmp_path / "weights.npz")
             body = toy_body()
-            np.savez(skinning.weights_file, vertices=store.canonical_vertices, weights=body.weights.numpy())
+            np.savez(skinning.weights_file, vertices=store.template.vertices, weights=body.weights.numpy())
         steps = {"steps": 6, "refresh_cells_every": 2, "validate_every": 6, "checkpoint_every": 4, "bootstrap_steps": 3}
         return TrainConfig(
             subject="toy", data=DataConfig("builtin", 1, 1, 1), model=parts.model, skinning=skinning, search=search,

@@ -149,7 +149,7 @@ def test_unposing_by_the_nearest_bone_straightens_the_capsule(store):
     sequence = store.sequences("train")[0]
     bent = max(range(sequence.num_frames), key=lambda f: abs(sequence.poses[f, 1, 2]))
     vertices = torch.as_tensor(sequence.vertices(bent))
-    canonical = torch.as_tensor(store.canonical_vertices)
+    canonical = torch.as_tensor(store.template.vertices)
     unposed = unpose_by_nearest_bone(vertices, torch.as_tensor(sequence.bone_transforms[bent]), store.skeleton)
     assert (vertices - canonical).norm(dim=1).max() > 0.3
     assert (unposed - canonical).norm(dim=1).max() < 0.12  # near the bend the nearest bone is not the right one

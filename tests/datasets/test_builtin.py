@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from snarfcli.datasets.subjects import BUILTIN_SUBJECTS, HELD_OUT_SEQUENCES, builtin_subject
+from snarfcli.bodies import builtin_body
+from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, HELD_OUT_SEQUENCES, builtin_subject
 from snarfcli.errors import UserError
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
+
+BODY = builtin_body()
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +44,11 @@ def test_every_exercise_is_someones(subjects):
 def test_shapes_are_plausible_and_distinct(subjects):
     for data in subjects.values():
         assert np.abs(data.betas).max() <= 2 and data.betas.shape == (10,)
-        height = np.ptp(data.body.shaped(data.betas)[0][:, 1].numpy())
+        height = np.ptp(BODY.shaped(data.betas)[0][:, 1].numpy())
         assert 1.45 < height < 1.95
     for one, other in combinations(subjects.values(), 2):
         assert np.linalg.norm(one.betas - other.betas) > 1.0
-        apart = (one.body.shaped(one.betas)[0] - other.body.shaped(other.betas)[0]).norm(dim=1)
+        apart = (BODY.shaped(one.betas)[0] - BODY.shaped(other.betas)[0]).norm(dim=1)
         assert apart.mean() > 0.005  # metres
 
 
@@ -61,16 +64,16 @@ def test_same_subject_again(subjects):
 
 def test_skeleton_is_the_shaped_bodys(subjects):
     data = subjects["50025"]
-    torch.testing.assert_close(data.skeleton.joints_rest, data.body.shaped(data.betas)[1])
+    torch.testing.assert_close(data.skeleton.joints_rest, BODY.shaped(data.betas)[1])
 
 
 def test_feet_reach_everyones_own_floor(subjects):
     for subject in ("50002", "50007", "50025"):
         data = subjects[subject]
-        floor = data.body.shaped(data.betas)[0][:, 1].min()
+        floor = BODY.shaped(data.betas)[0][:, 1].min()
         for sequence in data.sequences:
             motion = sequence.motion.slice(step=sequence.motion.num_frames // 4)
-            lowest = data.body.pose(motion.poses, data.betas, motion.translation).vertices[..., 1].amin(1) - floor
+            lowest = BODY.pose(motion.poses, data.betas, motion.translation).vertices[..., 1].amin(1) - floor
             assert lowest.min() > -0.05 and lowest.max() < 0.15, sequence.name  # hops reach about 0.1 m
 
 

@@ -1,0 +1,148 @@
+"""Where the posed meshes of a sequence come from: arrays, a body model, a rig, or files."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from snarfcli.bodies import Body
+
+__all__ = ["ArrayMeshes", "BodyMeshes", "FileMeshes", "PosedMeshes", "RigMeshes"]
+
+Mesh = tuple[NDArray, NDArray]
+
+
+class PosedMeshes(Protocol):
+    """The posed meshes of one sequence, frame by frame: vertices [V, 3], metres, and outward faces [F, 3].
+
+    `chosen` is called where the data set was loaded and hands some frames on to a worker process, which asks for the meshes:
+    what it returns must be picklable, and small or quickly made.
+    """
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Mesh: ...
+
+    def chosen(self, frames: NDArray[np.int64]) -> PosedMeshes:
+        """Return the meshes of some frames."""
+        ...
+
+    def fingerprint(self) -> str:
+        """Return a word that changes when the files do that the meshes are read from; empty if there are none."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayMeshes:
+    """Meshes of one topology that are in memory."""
+
+    vertices: NDArray
+    """[T, V, 3] metres."""
+    faces: NDArray
+    """[F, 3] vertex numbers, outward."""
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    def __getitem__(self, index: int) -> Mesh:
+        return self.vertices[index], self.faces
+
+    def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
+        return ArrayMeshes(self.vertices[frames], self.faces)
+
+    def fingerprint(self) -> str:
+        return ""
+
+
+class BodyMeshes:
+    """A body model in the poses of a motion; posed when frames are chosen.
+
+    Args:
+        body: the model.
+        betas: [S'] shape parameters.
+        poses: [T, J, 3] axis-angle, radians.
+        translation: [T, 3] metres.
+    """
+
+    def __init__(self, body: Body, betas: NDArray, poses: NDArray, translation: NDArray) -> None:
+        self.body, self.betas, self.poses, self.translation = body, betas, poses, translation
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def __getitem__(self, index: int) -> Mesh:
+        return self.chosen(np.array([index]))[0]
+
+    def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
+        body = self.body.to(torch.float64)
+        pose, translation = torch.from_numpy(self.poses[frames]), torch.from_numpy(self.translation[frames])
+        posed = [  # one at a time: the pose correctives of many are large
+            body.pose(pose[i : i + 1], self.betas, translation[i : i + 1]).vertices[0] for i in range(len(frames))
+        ]
+        return ArrayMeshes(torch.stack(posed).numpy().astype(np.float32), body.faces.numpy().astype(np.int32))
+
+    def fingerprint(self) -> str:
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class RigMeshes:
+    """A mesh moved by the joints of a rig: linear blend skinning, done when frames are chosen."""
+
+    vertices: NDArray
+    """[V, 3] in the rest pose, metres."""
+    faces: NDArray
+    """[F, 3] vertex numbers, outward."""
+    weights: NDArray
+    """[V, J] skinning weights, rows sum to 1."""
+    posed_from_rest: NDArray
+    """[T, J, 4, 4] bone transforms, metres."""
+
+    def __len__(self) -> int:
+        return len(self.posed_from_rest)
+
+    def __getitem__(self, index: int) -> Mesh:
+        return self.chosen(np.array([index]))[0]
+
+    def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
+        rows = self.posed_from_rest[frames][:, :, :3].reshape(len(frames), -1, 12)
+        blended = (self.weights @ rows).reshape(len(frames), -1, 3, 4)
+        posed = np.einsum("tvrc,vc->tvr", blended[..., :3], self.vertices) + blended[..., 3]
+        return ArrayMeshes(posed.astype(np.float32), self.faces.astype(np.int32))
+
+    def fingerprint(self) -> str:
+        return ""
+
+
+@dataclass(frozen=True, eq=False)
+class FileMeshes:
+    """One mesh file a frame, read where the meshes are asked for."""
+
+    paths: Sequence[Path]
+    """T files."""
+    read: Callable[[Path], Mesh]
+    """A module-level function that reads one."""
+    world_from_file: NDArray
+    """[4, 4] what turns and scales a file's vertices into the data set's world, metres."""
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> Mesh:
+        vertices, faces = self.read(self.paths[index])
+        return vertices @ self.world_from_file[:3, :3].T + self.world_from_file[:3, 3], faces
+
+    def chosen(self, frames: NDArray[np.int64]) -> FileMeshes:
+        return FileMeshes([self.paths[frame] for frame in frames], self.read, self.world_from_file)
+
+    def fingerprint(self) -> str:
+        # Names and sizes, not times: a copy of a data set is the same data set.
+        sizes = "\n".join(f"{path.name} {path.stat().st_size}" for path in self.paths)
+        return hashlib.sha256(sizes.encode()).hexdigest()[:16]

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
+import re
 import secrets
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from snarfcli.errors import UserError
 
-__all__ = ["atomic_path", "read_json", "read_npz", "write_json", "write_tensors"]
+__all__ = ["MAX_ARRAY_BYTES", "atomic_path", "read_json", "read_npy", "read_npz", "write_json", "write_tensors"]
 
-# An archive of zeros can unpack to a thousand times its size. Poses and meshes shrink by less than ten.
-_MAX_UNPACKED = 2**29
-_MAX_UNPACKED_RATIO = 20
+MAX_ARRAY_BYTES = 2**30
+"""What the arrays of one file may take, unless a reader says otherwise."""
+# Deflate packs at most about 1030 to 1. Arrays of zeros, such as unused hands, come close to it, but no large file as a whole.
+_BOMB_BYTES = 2**26
+_BOMB_RATIO = 500
+_LONGEST_HEADER = 2**16
+# The header is a Python dict of three entries; a type that is no word stands for records.
+_HEADER = (r"'descr':\s*'([^']*)'", r"'fortran_order':\s*(True|False)", r"'shape':\s*\(([\d\sL,]*)\)")
 
 
 @contextmanager
@@ -80,43 +87,150 @@ def read_json(path: str | Path, what: str = "file") -> Any:
         raise UserError(f"{what} {path} is not valid JSON ({error}); make it again") from None
 
 
-def read_npz(path: str | Path, what: str = "file") -> dict[str, np.ndarray]:
-    """Read every array of an `.npz` file without ever unpickling anything.
+def read_npz(
+    path: str | Path, what: str = "file", *, only: Collection[str] | None = None, max_bytes: int = MAX_ARRAY_BYTES
+) -> dict[str, np.ndarray]:
+    """Read the arrays of an `.npz` file without ever unpickling anything; members that are no arrays are left out.
+
+    Sizes are checked before anything is unpacked, so a file that unpacks to more than it may costs nothing.
+
+    Args:
+        path: file.
+        what: what it is, for messages.
+        only: names of the arrays to read; without them all. What is not read may hold anything.
+        max_bytes: what the arrays may take together.
 
     Raises:
-        UserError: the file is missing, cannot be opened, is not a zip archive, is truncated, holds pickled objects, or unpacks
-            to an absurd size.
+        UserError: the file is missing, cannot be opened, is not a zip archive, is truncated, damaged, encrypted, too large or
+            packed beyond reason; an array is there twice, holds pickled objects or records.
     """
     path = Path(path)
-    if path.is_dir():
-        raise UserError(f"{what} {path} is a folder; name an .npz file")
-    if not path.exists():
-        raise UserError(f"no {what} at {path}")
+    _check_regular(path, what, "an .npz")
     try:
         with path.open("rb") as file:
-            is_archive = zipfile.is_zipfile(file)
-    except OSError as error:
-        raise UserError(f"{what} {path} cannot be opened ({error.strerror or error})") from None
-    if not is_archive:
-        raise UserError(f"{what} {path} is not an .npz archive, or is truncated; copy or download it again")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > max(_MAX_UNPACKED, _MAX_UNPACKED_RATIO * path.stat().st_size):
-            raise UserError(f"{what} {path} unpacks to {unpacked / 2**30:.1f} GiB, far more than it should; get another copy")
-        content = np.load(path, allow_pickle=False)
-        if isinstance(content, np.ndarray):  # the bytes of an .npy file in front of an archive
-            raise UserError(f"{what} {path} is not an .npz archive; copy or download it again")
-        with content as archive:
-            arrays = {key: archive[key] for key in archive.files}
-            return {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}  # others come as bytes
+            if not zipfile.is_zipfile(file):
+                raise UserError(f"{what} {path} is not an .npz archive, or is truncated; copy or download it again")
+            with zipfile.ZipFile(file) as archive:
+                members = _members(archive, f"{what} {path}", only, max_bytes)
+                arrays = {}
+                for name, member in members.items():
+                    with archive.open(member) as stream:
+                        array = _read_array(stream, member.file_size, f"{what} {path}: {name!r:.60}")
+                    if array is not None:
+                        arrays[name] = array
+                return arrays
     except UserError:
         raise
-    except Exception as error:  # numpy and zipfile let many kinds through; tests/fuzz_targets.py found over ten
-        reason = str(error) or type(error).__name__
-        if "allow_pickle" in reason:
-            raise UserError(f"{what} {path} holds pickled objects, which are never executed; save plain arrays") from None
+    except Exception as error:  # zipfile lets many kinds through; tests/fuzz_targets.py found over ten
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or type(error).__name__
         raise UserError(f"{what} {path} is damaged ({_one_line(reason)}); copy or download it again") from None
+
+
+def read_npy(path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY_BYTES) -> np.ndarray:
+    """Read the array of an `.npy` file without ever unpickling anything; the size is checked first.
+
+    Raises:
+        UserError: the file is missing, cannot be opened, is not an `.npy` file, is truncated, too large, or holds pickled
+            objects or records.
+    """
+    path = Path(path)
+    _check_regular(path, what, "an .npy")
+    try:
+        size = path.stat().st_size
+        if size > max_bytes:
+            raise UserError(f"{what} {path} has {size / 2**20:,.0f} MiB, more than {max_bytes / 2**20:,.0f}; cut it into parts")
+        with path.open("rb") as file:
+            array = _read_array(file, size, f"{what} {path}")
+    except OSError as error:
+        raise UserError(f"{what} {path} cannot be read ({error.strerror or error})") from None
+    if array is None:
+        raise UserError(f"{what} {path} is not an .npy file, or is truncated; copy or download it again")
+    return array
+
+
+def _check_regular(path: Path, what: str, kind: str) -> None:
+    """Refuse what is missing or is no file, such as a folder or a pipe, which would be waited for."""
+    if path.is_dir():
+        raise UserError(f"{what} {path} is a folder; name {kind} file")
+    if not path.exists():
+        raise UserError(f"no {what} at {path}")
+    if not path.is_file():
+        raise UserError(f"{what} {path} is no regular file; name {kind} file")
+
+
+def _members(
+    archive: zipfile.ZipFile, subject: str, only: Collection[str] | None, max_bytes: int
+) -> dict[str, zipfile.ZipInfo]:
+    """Return the members to read by name, once their sizes and kinds are known to be sane."""
+    members: dict[str, zipfile.ZipInfo] = {}
+    for member in archive.infolist():
+        name = member.filename.removesuffix(".npy")
+        if member.is_dir() or (only is not None and name not in only):
+            continue
+        if name in members:
+            raise UserError(f"{subject} holds {name!r:.60} twice; save it again")
+        if member.flag_bits & 1:
+            raise UserError(f"{subject} is damaged or encrypted; copy or download it again")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise UserError(f"{subject} is packed in a way that is not read; save it again with numpy.savez_compressed")
+        members[name] = member
+    total, packed = (sum(getattr(member, size) for member in members.values()) for size in ("file_size", "compress_size"))
+    if total > max_bytes:
+        raise UserError(f"{subject} unpacks to {total / 2**20:,.0f} MiB, more than {max_bytes / 2**20:,.0f}; cut it into parts")
+    if total > _BOMB_BYTES and total > _BOMB_RATIO * packed:
+        raise UserError(f"{subject} unpacks to {total / 2**20:,.0f} MiB from {packed / 2**10:,.0f} KiB, which no data does")
+    return members
+
+
+def _read_array(stream: IO[bytes], size: int, subject: str) -> np.ndarray | None:
+    """Read one array in NumPy's own format, of `size` bytes in all; None if it is something else.
+
+    NumPy's reader would believe any length that the header declares, and evaluates the header as Python.
+    """
+    damaged = UserError(f"{subject} is damaged; copy or download the file again")
+    magic = stream.read(8)
+    if magic[:6] != b"\x93NUMPY":
+        return None
+    if len(magic) < 8 or magic[6] not in (1, 2, 3):
+        raise damaged
+    width = 2 if magic[6] == 1 else 4
+    length = int.from_bytes(stream.read(width), "little")
+    if length > min(_LONGEST_HEADER, size):
+        raise damaged
+    header = stream.read(length).decode("latin1")
+    found = [re.search(pattern, header) for pattern in _HEADER]
+    if not all(found):
+        if "'descr': [" in header:
+            raise UserError(f"{subject} holds records; save plain arrays")
+        raise damaged
+    descr, order, shape = (match[1] for match in found)
+    try:
+        dtype = np.dtype(descr)
+    except Exception:  # whatever NumPy makes of a word that is no type
+        raise damaged from None
+    if dtype.hasobject:
+        raise UserError(f"{subject} holds pickled objects, which are never executed; save plain arrays")
+    numbers = [number.rstrip("L") for number in shape.replace(" ", "").split(",") if number]
+    if any(len(number) > 18 for number in numbers):  # over 2^59
+        raise damaged
+    lengths = tuple(int(number) for number in numbers)
+    count = math.prod(lengths)
+    if count * dtype.itemsize != size - 8 - width - length or (dtype.itemsize == 0 and count > 1):
+        raise damaged
+    content = bytearray(count * dtype.itemsize)
+    filled, view = 0, memoryview(content)
+    while filled < len(content):
+        got = stream.readinto(view[filled : filled + 2**20])
+        if not got:
+            raise damaged
+        filled += got
+    if stream.read(1):  # at the end the archive compares checksums
+        raise damaged
+    try:
+        flat = np.frombuffer(content, dtype, count) if content else np.zeros(count, dtype)
+        return flat.reshape(lengths, order="F" if order == "True" else "C")
+    except (ValueError, TypeError):  # too many dimensions, say
+        raise damaged from None
 
 
 def _one_line(reason: str) -> str:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from snarfcli.errors import UserError
-from snarfcli.files import atomic_path, read_npz, write_json, write_tensors
+from snarfcli.files import atomic_path, read_npy, read_npz, write_json, write_tensors
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
@@ -82,3 +82,97 @@ def test_what_is_no_array_is_left_out(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "mixed.npz", "a") as archive:
         archive.writestr("poses", "bytes of no array")
     assert list(read_npz(tmp_path / "mixed.npz")) == ["x"]
+
+
+def packed(path: Path, *members: tuple[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
+    with zipfile.ZipFile(path, "w", method) as archive:
+        for name, content in members:
+            archive.writestr(name, content)
+    return path
+
+
+def npy(array: np.ndarray, **header: object) -> bytes:
+    """The bytes of an .npy file, with entries of its header changed."""
+    import io
+
+    content = io.BytesIO()
+    np.lib.format.write_array_header_1_0(content, {**np.lib.format.header_data_from_array_1_0(array), **header})
+    return content.getvalue() + array.tobytes()
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_archives_that_are_strange_end_in_one_line(tmp_path: Path) -> None:
+    good = npy(np.arange(3))
+    records = np.zeros(2, [("a", "f4"), ("b", "i4")])
+    bomb = packed(tmp_path / "bomb.npz", ("x.npy", npy(np.zeros(10**8, np.int8))))
+    assert bomb.stat().st_size < 2 * 10**5
+    packed(tmp_path / "twice.npz", ("x.npy", good), ("x.npy", good))
+    packed(tmp_path / "lzma.npz", ("x.npy", good), method=zipfile.ZIP_LZMA)
+    packed(tmp_path / "records.npz", ("x.npy", npy(records)))
+    packed(tmp_path / "absurd.npz", ("x.npy", npy(np.arange(3), shape=(10**12, 10**12))))
+    packed(tmp_path / "nothing.npz", ("x.npy", npy(np.zeros(0, "V0"), shape=(10**12,))))
+    packed(tmp_path / "long.npz", ("x.npy", good + b"more"))
+    packed(tmp_path / "deep.npz", ("x.npy", npy(np.zeros(1), shape=(1,) * 99)))
+    packed(tmp_path / "header.npz", ("x.npy", b"\x93NUMPY\x02\x00" + (2**31).to_bytes(4, "little") + bytes(100)))
+    (tmp_path / "npy.npz").write_bytes(good)
+    wrong = {
+        "bomb": "unpacks to 95 MiB from .* KiB, which no data does", "twice": "holds 'x' twice", "lzma": "packed in a way",
+        "records": "holds records", "absurd": "damaged", "nothing": "damaged", "long": "damaged", "deep": "damaged",
+        "header": "damaged", "npy": "not an .npz",
+    }  # fmt: skip
+    for name, message in wrong.items():
+        with pytest.raises(UserError, match=message) as caught:
+            read_npz(tmp_path / f"{name}.npz", "body")
+        assert "\n" not in str(caught.value) and name in str(caught.value)
+    large = packed(tmp_path / "large.npz", ("x.npy", npy(np.random.default_rng(0).normal(size=2000))))
+    with pytest.raises(UserError, match="unpacks to 0 MiB, more than 0; cut it into parts"):
+        read_npz(large, max_bytes=16000)
+
+
+def test_what_is_not_asked_for_may_hold_anything(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", x=np.arange(3), y=np.array([{}], dtype=object))
+    assert list(read_npz(tmp_path / "a.npz", only=("x", "z"))) == ["x"]
+    packed(tmp_path / "b.npz", ("folder/", b""), ("../x.npy", npy(np.arange(3))))
+    assert read_npz(tmp_path / "b.npz")["../x"].tolist() == [0, 1, 2] and not (tmp_path.parent / "x.npy").exists()
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(6.0).reshape(2, 3), np.asfortranarray(np.arange(6, dtype=">i2").reshape(2, 3)), np.array("neutral"),
+        np.array(b"male"), np.zeros((0, 3)), np.array(2.5), np.array([True, False]), np.array(["a", "bc"]),
+        np.array(1 + 2j), np.array("2020-01-01", "M8[D]"), np.array(""),
+    ],
+    ids=lambda array: f"{array.dtype}{list(array.shape)}",
+)  # fmt: skip
+def test_arrays_come_back_as_they_were(array: np.ndarray, tmp_path: Path) -> None:
+    for save in (np.savez, np.savez_compressed):
+        save(tmp_path / "a.npz", x=array)
+        back = read_npz(tmp_path / "a.npz")["x"]
+        assert back.dtype == array.dtype and back.shape == array.shape and back.tobytes() == array.tobytes()
+    np.save(tmp_path / "a.npy", array)
+    back = read_npy(tmp_path / "a.npy")
+    assert back.dtype == array.dtype and back.shape == array.shape and back.tobytes() == array.tobytes()
+    assert back.flags.writeable
+
+
+def test_npy_files_that_are_none_end_in_one_line(tmp_path: Path) -> None:
+    good = npy(np.arange(3))
+    contents = {
+        "cut": good[:-1], "empty": b"", "text": b"poses", "objects": npy(np.zeros(0), descr="|O"),
+        "longer": good + b"0", "absurd": npy(np.arange(3), shape=(2**62,)),
+    }  # fmt: skip
+    wrong = {
+        "cut": "damaged", "empty": "not an .npy", "text": "not an .npy", "objects": "never executed", "longer": "damaged",
+        "absurd": "damaged", "missing": "no pose file at",
+    }  # fmt: skip
+    for name, content in contents.items():
+        (tmp_path / f"{name}.npy").write_bytes(content)
+    for name, message in wrong.items():
+        with pytest.raises(UserError, match=message) as caught:
+            read_npy(tmp_path / f"{name}.npy", "pose file")
+        assert "\n" not in str(caught.value) and name in str(caught.value)
+    with pytest.raises(UserError, match="has 0 MiB, more than 0"):
+        read_npy(tmp_path / "longer.npy", max_bytes=8)
+    with pytest.raises(UserError, match="is a folder"):
+        read_npy(tmp_path)

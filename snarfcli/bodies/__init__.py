@@ -1,7 +1,13 @@
 """Skeletons and bodies: rotations, forward kinematics, SMPL-format models, the built-in body (CC0-1.0)."""
 
 from snarfcli.bodies.body import Body, PosedBody, builtin_body, load_body
-from snarfcli.bodies.kinematics import axis_angle_to_matrix, forward_kinematics, invert_rigid, matrix_to_axis_angle
+from snarfcli.bodies.kinematics import (
+    axis_angle_to_matrix,
+    forward_kinematics,
+    invert_rigid,
+    matrix_to_axis_angle,
+    pose_from_transforms,
+)
 from snarfcli.bodies.skeleton import SMPL_JOINT_NAMES, Skeleton, legs_apart_pose
 
 __all__ = [
@@ -16,4 +22,5 @@ __all__ = [
     "legs_apart_pose",
     "load_body",
     "matrix_to_axis_angle",
+    "pose_from_transforms",
 ]

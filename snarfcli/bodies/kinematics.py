@@ -7,7 +7,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["axis_angle_to_matrix", "forward_kinematics", "invert_rigid", "matrix_to_axis_angle"]
+__all__ = [
+    "axis_angle_to_matrix",
+    "forward_kinematics",
+    "invert_rigid",
+    "matrix_to_axis_angle",
+    "nearest_rotation",
+    "pose_from_transforms",
+]
+
+# How far from a joint its frame is compared, metres: about the size of a hand, so that turns and scale show as lengths.
+_REACH_M = 0.1
 
 # Below this squared angle the series to t^8 is used: its first missing term, t^10 / 11!, is then under 3e-18.
 _SMALL_ANGLE_SQUARED = 1e-2
@@ -120,8 +130,7 @@ def forward_kinematics(
         raise ValueError(f"joints_rest: wanted shape [{joints}, 3] or [{batch}, {joints}, 3], got {list(joints_rest.shape)}")
     if translation is not None and translation.shape != (batch, 3):
         raise ValueError(f"translation: wanted shape [{batch}, 3], got {list(translation.shape)}")
-    if any(not -1 <= parent < joint for joint, parent in enumerate(parents)) or parents[0] != -1:
-        raise ValueError("parents: every parent must come before its child, and joint 0 must be the root (-1)")
+    _check_parents(parents)
     rest = joints_rest.expand(batch, joints, 3)
     local = axis_angle_to_matrix(pose)
     rotations: list[Tensor] = []
@@ -140,3 +149,70 @@ def forward_kinematics(
     top = torch.cat([rotation, offset[..., None]], -1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(batch, joints, 1, 4)
     return joints_posed, torch.cat([top, bottom], -2)
+
+
+def nearest_rotation(matrix: Tensor) -> Tensor:
+    """Return the rotation matrices nearest to any matrices (least squares): without scale, shear and reflection.
+
+    Args:
+        matrix: [..., 3, 3], float32 or float64, finite. Rotations come back as they are, up to rounding.
+
+    Returns:
+        [..., 3, 3] rotation matrices; arbitrary ones where the matrix leaves the choice, as zero does.
+    """
+    eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
+    error = (matrix.transpose(-1, -2) @ matrix - eye).abs().amax((-1, -2))
+    is_off = (error > 64 * torch.finfo(matrix.dtype).eps) | (torch.linalg.det(matrix) < 0)
+    rotation = matrix.clone()
+    if is_off.any():  # the decomposition takes long, and most matrices are rotations
+        u, _, vh = torch.linalg.svd(matrix[is_off])
+        sign = torch.linalg.det(u @ vh)
+        u = torch.cat([u[..., :2], u[..., 2:] * sign[..., None, None]], -1)
+        rotation[is_off] = u @ vh
+    return rotation
+
+
+def pose_from_transforms(
+    posed_from_rest: Tensor, parents: Sequence[int], joints_rest: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the poses that move a joint tree as given bone transforms do: the way back from `forward_kinematics`.
+
+    Args:
+        posed_from_rest: [T, J, 4, 4] transforms that move a point of the rest pose with each bone, metres, float32 or float64.
+            Scale, shear and reflection are left out of the poses, and so are joints that come apart: see the residual.
+        parents: J parents, -1 for the root; a parent comes before its children.
+        joints_rest: [J, 3] joint positions in the rest pose, metres.
+
+    Returns:
+        poses [T, J, 3] axis-angle, radians; translation [T, 3] metres; and the residual [T], metres: how far the poses are from
+        reproducing the transforms. It is the largest distance between where the transforms and where the poses put the
+        joints and the points 0.1 m from them along the axes. Rounding leaves about 1e-6 of it in float32.
+
+    Raises:
+        ValueError: a shape does not match, a number is not finite, or a parent does not come before its child.
+    """
+    joints = len(parents)
+    if posed_from_rest.ndim != 4 or posed_from_rest.shape[1:] != (joints, 4, 4):
+        raise ValueError(f"posed_from_rest: wanted shape [T, {joints}, 4, 4], got {list(posed_from_rest.shape)}")
+    if joints_rest.shape != (joints, 3):
+        raise ValueError(f"joints_rest: wanted shape [{joints}, 3], got {list(joints_rest.shape)}")
+    _check_parents(parents)
+    if not posed_from_rest.isfinite().all():
+        raise ValueError("posed_from_rest: wanted finite numbers, got NaN or infinity")
+    rest = joints_rest.to(posed_from_rest)
+    rotation = nearest_rotation(posed_from_rest[..., :3, :3])
+    relative = [rotation[:, j] if p < 0 else rotation[:, p].transpose(-1, -2) @ rotation[:, j] for j, p in enumerate(parents)]
+    poses = matrix_to_axis_angle(torch.stack(relative, 1))
+    root = (posed_from_rest[:, 0, :3, :3] @ rest[0]) + posed_from_rest[:, 0, :3, 3]
+    translation = root - rest[0]
+    again = forward_kinematics(poses, rest, parents, translation)[1]
+    reach = torch.cat([torch.zeros(1, 3), _REACH_M * torch.eye(3)]).to(rest)
+    error = posed_from_rest - again
+    # [T, J, 4, 3]: what both make of the joint and of the three points beside it
+    apart = (error[..., None, :3, :3] @ (rest[:, None] + reach)[..., None]).squeeze(-1) + error[..., None, :3, 3]
+    return poses, translation, apart.norm(dim=-1).amax((1, 2))
+
+
+def _check_parents(parents: Sequence[int]) -> None:
+    if any(not -1 <= parent < joint for joint, parent in enumerate(parents)) or parents[0] != -1:
+        raise ValueError("parents: every parent must come before its child, and joint 0 must be the root (-1)")

@@ -37,3 +37,24 @@ def npz() -> Target:
         return made
 
     return Target("npz", ".npz", seeds, read_npz)
+
+
+@_target
+def bvh() -> Target:
+    from snarfcli.formats.bvh import read_bvh
+
+    def seeds() -> list[bytes]:
+        end = "End Site {{ OFFSET 0 {} 0 }} }}"
+        arm = "JOINT Arm { OFFSET 0 9 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n" + end.format(1)
+        leg = "JOINT Leg { OFFSET 1.5 -8 0\nCHANNELS 6 Xposition Yposition Zposition Yrotation Xrotation Zrotation\n"
+        leg += end.format(-1)
+        root = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n"
+        values = " ".join(str(number / 4) for number in range(15))
+        motion = "MOTION\nFrames: 3\nFrame Time: 0.0083333\n"
+        return [
+            f"{root}{arm}\n{leg}\n}}\n{motion}{values}\n{values}\n{values}\n".encode(),
+            f"{root}{arm}\n}}\n{motion}".replace("\n", "\r\n").encode() + b"1 2 3 4 5 6 7e0 8 -9.5\r\n" * 3,
+            f"{root}}}\n".encode() + b"MOTION\nFrames: 40\nFrame Time: 0\n" + b"0 90 0 0 0 45\n" * 40,
+        ]
+
+    return Target("bvh", ".bvh", seeds, read_bvh)

@@ -5,6 +5,7 @@ To add a reader, add a function with `@_target` anywhere below: its name is what
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 
 from fuzzing import Target
@@ -58,3 +59,67 @@ def bvh() -> Target:
         ]
 
     return Target("bvh", ".bvh", seeds, read_bvh)
+
+
+@_target
+def gltf() -> Target:
+    from toy_animal import animal_motion, make_animal
+    from toy_animal_files import animal_glb
+    from toy_gltf import GltfBuilder
+
+    from snarfcli.formats.gltf import read_gltf
+
+    def robot() -> GltfBuilder:
+        builder = GltfBuilder()
+        corners = builder.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        faces = builder.array([0, 2, 1, 0, 1, 3, 1, 2, 3, 2, 0, 3], "uint16")
+        keys = builder.array([[0, 0, 0]] * 2 + [[1, 0, 0]] * 2 + [[0, 0, 1]] * 2)
+        samplers = [{"input": builder.array([0.0, 0.5]), "output": keys, "interpolation": "CUBICSPLINE"}]
+        builder.root.update(
+            scenes=[{"nodes": [0]}],
+            nodes=[{"children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "children": [2]}, {"mesh": 0, "name": "top"}],
+            meshes=[{"primitives": [{"attributes": {"POSITION": corners}, "indices": faces, "mode": mode} for mode in (4, 5)]}],
+            animations=[{"samplers": samplers, "channels": [{"sampler": 0, "target": {"node": 1, "path": "translation"}}]}],
+        )
+        return builder
+
+    def seeds() -> list[bytes]:
+        animal = animal_glb(make_animal(0.08), [animal_motion("walk", 3), animal_motion("sit", 2)])
+        return [animal, robot().glb(), robot().gltf()]
+
+    return Target("gltf", ".glb", seeds, read_gltf, _with_broken_json)
+
+
+def _with_broken_json(rng: random.Random, content: bytes) -> bytes:
+    """Change one to three values of a glTF file's JSON, and keep the container around it whole."""
+    import json
+    import struct
+
+    is_binary = content[:4] == b"glTF"
+    size = struct.unpack_from("<I", content, 12)[0] if is_binary else len(content)
+    root = json.loads(content[20 : 20 + size] if is_binary else content)
+    for _ in range(rng.choice([1, 1, 2, 3])):
+        owner, key = root, rng.choice(list(root))
+        while isinstance(owner[key], (dict, list)) and owner[key] and rng.random() < 0.9:
+            owner = owner[key]
+            key = rng.choice(list(owner)) if isinstance(owner, dict) else rng.randrange(len(owner))
+        nasty = [-1, 0, 1, 2, 3, 7, 10**6, 10**9, 2**31, 2**63, 10**30, 1e30, 1e-30, 1e308, float("nan"), float("inf"), None,
+                 True, "", "x\x1b[2J\u2028", "9" * 3000, [], {}, [[]], [0, 0, 0], [0] * 16, {"node": 0}, "data:,",
+                 "/etc/passwd", 5120, 5121, 5125, 5126, "MAT4", "VEC4", "STEP", list(range(300))]  # fmt: skip
+        action = rng.random()
+        if action < 0.15:
+            del owner[key]
+        elif action < 0.3 and isinstance(owner, list):
+            owner.extend([owner[key]] * rng.choice([1, 2, 1000]))
+        elif action < 0.4 and isinstance(owner, dict):
+            owner[rng.choice(["skin", "mesh", "children", "matrix", "sparse", "byteStride", "normalized", "uri"])] = owner[key]
+        else:
+            owner[key] = rng.choice(nasty)
+        if not root:
+            break
+    text = json.dumps(root).encode()
+    if not is_binary:
+        return text
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + size :]
+    return struct.pack("<IIIII", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest

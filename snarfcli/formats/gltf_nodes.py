@@ -1,0 +1,152 @@
+"""The node tree of a glTF file: who is whose parent, and where each node is, at rest and over time.
+
+Source: Khronos, glTF 2.0 specification, sections 3.5.2 and 3.5.3 (node hierarchy, transformations).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snarfcli.formats.gltf_file import GltfFile
+
+__all__ = ["NodeTree", "compose"]
+
+_MAX_NODES = 10_000
+
+
+def compose(
+    translation: NDArray[np.float64], rotation: NDArray[np.float64], scale: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return T @ R @ S [..., 4, 4] of translation [..., 3], unit quaternions [..., 4] (x, y, z, w) and scale [..., 3]."""
+    shape = np.broadcast_shapes(translation.shape[:-1], rotation.shape[:-1], scale.shape[:-1])
+    x, y, z, w = np.moveaxis(rotation, -1, 0)
+    matrix = np.zeros((*shape, 4, 4))
+    matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    matrix[..., 2, 0], matrix[..., 2, 1], matrix[..., 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    matrix[..., :3, :3] *= scale[..., None, :]
+    matrix[..., :3, 3] = translation
+    matrix[..., 3, 3] = 1
+    return matrix
+
+
+class NodeTree:
+    """The nodes of a file: a forest in which every node has at most one parent."""
+
+    def __init__(self, file: GltfFile) -> None:
+        """Read the hierarchy and the transformations at rest.
+
+        Raises:
+            UserError: a node is its own ancestor or has two parents, a number is out of range, a quaternion is zero.
+        """
+        self._file = file
+        self.nodes: list[dict[str, Any]] = file.items("nodes")
+        if len(self.nodes) > _MAX_NODES:
+            file.fail(f"has {len(self.nodes)} nodes, more than {_MAX_NODES}; simplify the scene")
+        self.parents = [-1] * len(self.nodes)
+        self._children = [self._read_children(number) for number in range(len(self.nodes))]
+        for number, children in enumerate(self._children):
+            for child in children:
+                if self.parents[child] >= 0:
+                    file.fail(f"node {child} has two parents; export it again")
+                self.parents[child] = number
+        self.order = self._below([number for number, parent in enumerate(self.parents) if parent < 0])
+        """All nodes, a parent before its children."""
+        if len(self.order) < len(self.nodes):
+            file.fail("a node is its own ancestor; export it again")
+        self._parts = [self._read_parts(number) for number in range(len(self.nodes))]
+        self.locals = [self._read_local(number) for number in range(len(self.nodes))]
+        """[4, 4] each: from the node's frame to its parent's, at rest."""
+
+    def _read_children(self, number: int) -> list[int]:
+        children = self.nodes[number].get("children", [])
+        if not isinstance(children, list):
+            self._file.fail(f"children of node {number} is not a list; export it again")
+        return [self._file.checked_index(child, "nodes", f"a child of node {number}") for child in children]
+
+    def _read_parts(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return translation, unit quaternion and scale of a node at rest."""
+        node, what = self.nodes[number], f"node {number}"
+        if "matrix" in node:  # the specification forbids shear here, and such nodes are not meant to be animated
+            matrix = self._file.numbers(node, "matrix", (0.0,) * 16, what).reshape(4, 4).T
+            scale = np.linalg.norm(matrix[:3, :3], axis=0)
+            if np.linalg.det(matrix[:3, :3]) < 0:
+                scale[0] = -scale[0]
+            return matrix[:3, 3], _quaternion(matrix[:3, :3] / np.where(scale == 0, 1.0, scale)), scale
+        rotation = self._file.numbers(node, "rotation", (0.0, 0.0, 0.0, 1.0), what)
+        length = np.linalg.norm(rotation)
+        if not length > 1e-12:
+            self._file.fail(f"rotation of {what} is a zero quaternion; export it again")
+        translation = self._file.numbers(node, "translation", (0.0, 0.0, 0.0), what)
+        return translation, rotation / length, self._file.numbers(node, "scale", (1.0, 1.0, 1.0), what)
+
+    def _read_local(self, number: int) -> NDArray[np.float64]:
+        node = self.nodes[number]
+        if "matrix" not in node:
+            return compose(*self._parts[number])
+        matrix = self._file.numbers(node, "matrix", (0.0,) * 16, f"node {number}").reshape(4, 4).T  # stored by columns
+        matrix[3] = 0.0, 0.0, 0.0, 1.0
+        return matrix
+
+    def _below(self, roots: Iterable[int]) -> list[int]:
+        """Return the nodes `roots` and all below them, a parent before its children."""
+        found, waiting = [], list(reversed(list(roots)))
+        while waiting:
+            number = waiting.pop()
+            found.append(number)
+            waiting.extend(reversed(self._children[number]))
+        return found
+
+    def in_scene(self) -> list[int]:
+        """Return the nodes of the default scene, all nodes where the file has no scene."""
+        file = self._file
+        number = file.index(file.root, "scene", "scenes", "the file")
+        scenes = file.items("scenes")
+        if not scenes:
+            return self.order
+        roots = scenes[number or 0].get("nodes", [])
+        if not isinstance(roots, list):
+            file.fail(f"nodes of scene {number or 0} is not a list; export it again")
+        roots = [file.checked_index(root, "nodes", f"a node of scene {number or 0}") for root in roots]
+        return self._below(dict.fromkeys(root for root in roots if self.parents[root] < 0))
+
+    def with_ancestors(self, numbers: Iterable[int]) -> list[int]:
+        """Return these nodes and all above them, a parent before its children."""
+        wanted: set[int] = set()
+        for number in numbers:
+            while number >= 0 and number not in wanted:
+                wanted.add(number)
+                number = self.parents[number]
+        return [number for number in self.order if number in wanted]
+
+    def worlds(
+        self, numbers: Iterable[int], animated: Mapping[int, Mapping[str, NDArray[np.float64]]] | None = None
+    ) -> dict[int, NDArray[np.float64]]:
+        """Return where nodes are: [T, 4, 4] each, from the node's frame to the world; T is 1 for those that stand still.
+
+        Args:
+            numbers: nodes, closed under `with_ancestors`, a parent before its children.
+            animated: for some nodes, some of `translation` [T, 3], `rotation` [T, 4] and `scale` [T, 3] over time.
+        """
+        found: dict[int, NDArray[np.float64]] = {}
+        for number in numbers:
+            local = self.locals[number]
+            if animated and number in animated:
+                rest = dict(zip(("translation", "rotation", "scale"), self._parts[number], strict=True))
+                local = compose(**{name: animated[number].get(name, value) for name, value in rest.items()})
+            parent = self.parents[number]
+            found[number] = local.reshape(-1, 4, 4) if parent < 0 else found[parent] @ local
+        return found
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit quaternion (x, y, z, w) nearest to a matrix that should be a rotation."""
+    from scipy.spatial.transform import Rotation
+
+    u, _, v = np.linalg.svd(rotation)
+    u[:, 2] *= np.sign(np.linalg.det(u @ v)) or 1.0
+    return Rotation.from_matrix(u @ v).as_quat()

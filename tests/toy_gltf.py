@@ -1,0 +1,54 @@
+"""Writes glTF files byte by byte, for tests; shares no code with the reader."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+__all__ = ["GltfBuilder"]
+
+_COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
+
+
+class GltfBuilder:
+    """Collects arrays; `root` is the JSON, to be written by the test."""
+
+    def __init__(self, **root: Any) -> None:
+        self.root: dict[str, Any] = {"asset": {"version": "2.0"}, "bufferViews": [], "accessors": [], **root}
+        self.binary = bytearray()
+
+    def view(self, content: bytes, **more: Any) -> int:
+        """Add a buffer view."""
+        self.binary.extend(b"\0" * (-len(self.binary) % 4))
+        self.root["bufferViews"].append({"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(content), **more})
+        self.binary.extend(content)
+        return len(self.root["bufferViews"]) - 1
+
+    def array(self, values: Any, dtype: str = "float32", **more: Any) -> int:
+        """Add an accessor: [N] SCALAR, [N, 3] VEC3, [N, 4, 4] MAT4 (stored by columns), and so on."""
+        values = np.asarray(values, dtype)
+        if values.ndim == 3:
+            values, kind = values.transpose(0, 2, 1), "MAT4"
+        else:
+            kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
+        accessor = {"componentType": _COMPONENTS[dtype], "count": len(values), "type": kind, **more}
+        accessor.setdefault("bufferView", self.view(values.astype(f"<{values.dtype.str[1:]}").tobytes()))
+        self.root["accessors"].append(accessor)
+        return len(self.root["accessors"]) - 1
+
+    def glb(self) -> bytes:
+        """Return a binary file."""
+        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
+        text = json.dumps({**self.root, "buffers": [{"byteLength": len(binary)}]}).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
+        return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
+
+    def gltf(self, uri: str | None = None) -> bytes:
+        """Return a text file whose buffer is at `uri`, in the file itself by default."""
+        uri = uri or "data:application/octet-stream;base64," + base64.b64encode(self.binary).decode()
+        return json.dumps({**self.root, "buffers": [{"byteLength": len(self.binary), "uri": uri}]}).encode()

@@ -20,6 +20,7 @@ from snarfcli.evaluation.evaluate import evaluate
 from snarfcli.evaluation.report import SPLITS, Evaluation, metrics_content, table, timings_text
 from snarfcli.files import write_json
 from snarfcli.models.avatar import Avatar
+from snarfcli.models.start_bones import with_start_bones
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
 
 __all__ = ["EvalConfig", "run"]
@@ -83,8 +84,9 @@ def run(config: EvalConfig) -> None:
     avatar = Avatar.load(path, device)
     _check_match(avatar, store, config)
     if config.search is not None:
+        search = with_start_bones(config.search, avatar.skeleton)
         try:
-            avatar.model.deformer.search = config.search
+            avatar.model.deformer.search = search
         except ValueError as error:
             raise UserError(f"{error}; leave search out, or give search=snarf") from None
     search = avatar.model.deformer.search
@@ -157,9 +159,6 @@ def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None
             f"the avatar has {theirs.num_joints} joints and the samples of subject {store.subject} have {ours.num_joints}, "
             "or they are joined otherwise; evaluate it on the data that it was trained on"
         )
-    bones = config.search.init_bones if config.search is not None else None
-    if bones is not None and not (bones and all(0 <= bone < ours.num_joints for bone in bones)):
-        raise UserError(f"search.init_bones must lie in 0..{ours.num_joints - 1}, got {bones}")
     for name, wanted in (("subject", store.subject), ("data", store.data)):
         trained_on = avatar.facts.get(name)
         if trained_on is not None and str(trained_on) != wanted:

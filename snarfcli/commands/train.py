@@ -22,6 +22,7 @@ from snarfcli.files import atomic_path, write_json
 from snarfcli.models.avatar import Avatar, load_checkpoint
 from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
 from snarfcli.models.preset import read_preset_weights
+from snarfcli.models.start_bones import with_start_bones
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.shape import ShapeConfig
@@ -38,7 +39,7 @@ log = logging.getLogger(__name__)
 _AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every")
 _NOT_NEGATIVE = (
     "uniform_points", "surface_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight", "joint_weight",
-    "validation_frames", "refresh_cells_every",
+    "validation_frames", "refresh_cells_every", "workers",
 )  # fmt: skip
 
 
@@ -166,6 +167,7 @@ def _check(config: TrainConfig) -> None:
 
 def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -> Trainer:
     """Return a fresh avatar of the store's subject in the hands of a trainer."""
+    search = with_start_bones(config.search, store.skeleton)
     surface = rough_canonical_surface(store)
     grid = CanonicalGrid.around(surface, config.skinning.margin_m)
     field = None
@@ -173,7 +175,7 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
         shape = tuple(config.skinning.resolution[::-1])
         field = read_preset_weights(config.skinning.weights_file, grid, shape, store.skeleton.num_joints)
     avatar = Avatar(
-        AvatarConfig(config.model, config.skinning, config.search, config.shape),
+        AvatarConfig(config.model, config.skinning, search, config.shape),
         store.skeleton,
         grid,
         surface,

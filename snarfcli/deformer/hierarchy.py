@@ -136,7 +136,7 @@ def make_softmax(name: str, num_bones: int, parents: Sequence[int] | None = None
     """
     if name not in SOFTMAXES:
         raise ValueError(f"skinning.softmax must be one of {', '.join(SOFTMAXES)}, got {name!r}")
-    if name == "plain":
+    if name == "plain" or num_bones == 1:  # one bone leaves nothing to choose: a network without outputs
         return PlainSoftmax(num_bones)
     if parents is None:
         raise ValueError("skinning.softmax='hierarchical' needs parents, the parent of each bone")

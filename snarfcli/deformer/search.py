@@ -15,7 +15,8 @@ class SearchConfig:
     name: str = "complete"
     """Which search: complete (cell by cell, without start bones) or broyden (the papers')."""
     init_bones: list[int] | None = None
-    """Bones whose inverse transforms start a broyden search; null means all bones."""
+    """Bones whose inverse transforms start a broyden search; null means all bones. An empty list, which is for
+    whoever knows the skeleton to fill in, stands for the papers' nine where the joints are SMPL's, else all."""
     jacobian: str = "exact"
     """Inverse Jacobian at broyden's roots: exact, or broyden for the approximation of the papers."""
     tolerance: float = 5e-6

@@ -11,9 +11,13 @@ __all__ = ["bone_segments", "unpose_by_nearest_bone", "weight_segments"]
 
 
 def bone_segments(skeleton: Skeleton, joints: Tensor | None = None) -> Tensor:
-    """Return the ends (parent, child) of the bones, [S, 2, 3], metres, in the canonical frame unless `joints` are given."""
+    """Return the ends (parent, child) of the bones, [S, 2, 3], metres, in the canonical frame unless `joints` are given.
+
+    A root without children is a point.
+    """
     joints = skeleton.canonical_joints if joints is None else joints
-    return torch.stack([torch.stack([joints[parent], joints[child]]) for parent, child in skeleton.bones])
+    alone = [(joint, joint) for joint in _leaves(skeleton) if skeleton.parents[joint] < 0]
+    return torch.stack([torch.stack([joints[parent], joints[child]]) for parent, child in skeleton.bones + alone])
 
 
 def weight_segments(skeleton: Skeleton) -> tuple[Tensor, list[int]]:

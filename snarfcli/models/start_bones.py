@@ -1,0 +1,31 @@
+"""Which bones start a Broyden search on a given skeleton."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton
+from snarfcli.deformer import SearchConfig
+from snarfcli.errors import UserError
+
+__all__ = ["with_start_bones"]
+
+# Those of the papers' released code: about one for each rigid part of a body.
+_PAPERS_BONES = ("pelvis", "l_hip", "r_hip", "l_knee", "r_knee", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow")
+
+
+def with_start_bones(search: SearchConfig, skeleton: Skeleton) -> SearchConfig:
+    """Return the search with start bones of the skeleton: an empty list becomes the papers' nine, or all where it is not SMPL's.
+
+    Raises:
+        UserError: a bone is given that the skeleton has not.
+    """
+    bones, count = search.init_bones, skeleton.num_joints
+    if bones is None:
+        return search
+    if not bones:
+        is_smpl = skeleton.names == SMPL_JOINT_NAMES
+        return replace(search, init_bones=[SMPL_JOINT_NAMES.index(name) for name in _PAPERS_BONES] if is_smpl else None)
+    if not all(0 <= bone < count for bone in bones):
+        raise UserError(f"search.init_bones must lie in 0..{count - 1}, got {bones}; null starts from all bones")
+    return search

@@ -123,3 +123,67 @@ def _with_broken_json(rng: random.Random, content: bytes) -> bytes:
     text += b" " * (-len(text) % 4)
     rest = content[20 + size :]
     return struct.pack("<IIIII", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+
+
+@_target
+def pickle() -> Target:
+    """Plain data, arrays and sparse matrices in every protocol, and what Python 2 and chumpy wrote."""
+    import pickle
+    from pathlib import Path
+
+    import numpy as np
+    import scipy.sparse
+    from pickle_damage import damaged
+
+    from snarfcli.formats.pickles import read_pickle
+
+    def seeds() -> list[bytes]:
+        content = {
+            "smpl_poses": np.linspace(0, 1, 12).reshape(2, 6), "names": ["a", "b"], "00032": "male", "n": (1, 2.5, None, True),
+            "text": np.array(["ab", "c"]), "big": np.arange(4, dtype=">i4"), "scalar": np.float32(3), "set": {1, 2},
+            "coo": scipy.sparse.coo_matrix(np.eye(2, 3)), "csr": scipy.sparse.csr_matrix(np.eye(2, 3)),
+            "objects": np.array([1, "x"], object),
+        }  # fmt: skip
+        made = [pickle.dumps(content, protocol) for protocol in range(6)]
+        return made + [path.read_bytes() for path in sorted((Path(__file__).parent / "bodies" / "golden").glob("*.pkl"))]
+
+    return Target("pickle", ".pkl", seeds, read_pickle, damaged)
+
+
+@_target
+def body() -> Target:
+    """Bodies in SMPL's format, as pickles."""
+    from pathlib import Path
+
+    from pickle_damage import damaged_body
+    from smpl_files import octahedron, pickled, toy
+
+    from snarfcli.bodies import load_body
+
+    def seeds() -> list[bytes]:
+        made = [pickled(octahedron()), pickled(toy(3, 4, vertices=8), selected=2), pickled(toy(55, 20, vertices=3), chumpy=())]
+        return made + [path.read_bytes() for path in sorted((Path(__file__).parent / "bodies" / "golden").glob("*.pkl"))]
+
+    return Target("body", ".pkl", seeds, load_body, damaged_body)
+
+
+@_target
+def body_npz() -> Target:
+    """Bodies in SMPL's format, as archives."""
+    import io
+
+    import numpy as np
+    from pickle_damage import damaged_arrays
+    from smpl_files import octahedron, toy
+
+    from snarfcli.bodies import load_body
+
+    def saved(arrays: dict) -> bytes:
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+        return buffer.getvalue()
+
+    def extra(rng, content: bytes) -> bytes:
+        return saved(damaged_arrays(rng, {**octahedron(), "joint_names": np.array(["a", "b"])}))
+
+    return Target("body_npz", ".npz", lambda: [saved(octahedron()), saved(toy(3, 4, vertices=8))], load_body, extra)

@@ -11,13 +11,23 @@ from torch import Tensor
 
 from snarfcli.bodies.kinematics import forward_kinematics, invert_rigid
 
-__all__ = ["CANONICAL_HIP_RAD", "SMPL_JOINT_NAMES", "Skeleton", "legs_apart_pose"]
+__all__ = ["CANONICAL_HIP_RAD", "SMPLH_JOINT_NAMES", "SMPLX_JOINT_NAMES", "SMPL_JOINT_NAMES", "Skeleton", "legs_apart_pose"]
 
 SMPL_JOINT_NAMES = (
     "pelvis", "l_hip", "r_hip", "spine1", "l_knee", "r_knee", "spine2", "l_ankle", "r_ankle", "spine3",
     "l_foot", "r_foot", "neck", "l_collar", "r_collar", "head", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow",
     "l_wrist", "r_wrist", "l_hand", "r_hand",
 )  # fmt: skip
+
+_FINGER_JOINT_NAMES = tuple(
+    f"{side}_{finger}{number}"
+    for side in ("l", "r")
+    for finger in ("index", "middle", "pinky", "ring", "thumb")
+    for number in (1, 2, 3)
+)
+# Both have SMPL's joints up to the wrists.
+SMPLH_JOINT_NAMES = (*SMPL_JOINT_NAMES[:22], *_FINGER_JOINT_NAMES)
+SMPLX_JOINT_NAMES = (*SMPL_JOINT_NAMES[:22], "jaw", "l_eye", "r_eye", *_FINGER_JOINT_NAMES)
 
 CANONICAL_HIP_RAD = torch.pi / 6
 """How far each leg is turned outwards in the canonical pose (SNARF's released code: 30 degrees)."""

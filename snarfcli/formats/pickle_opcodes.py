@@ -16,8 +16,8 @@ from snarfcli.formats.pickle_tree import Call, Name, PickleError, Raw, shown
 
 __all__ = ["read_tree"]
 
-# A body or motion takes some hundred steps, a long list of numbers one step a number. A million steps take about a second here.
-_MAX_STEPS = 1_000_000
+# A body or motion takes some hundred steps, a long list of numbers one step a number. Half a million take about a second.
+_MAX_STEPS = 500_000
 _NUMBER_LENGTH = 100
 
 

@@ -39,15 +39,19 @@ class Raw:
 
     @property
     def value(self) -> str | bytes:
-        """The text, or the bytes if it is none."""
-        if self._value is None and self.encoding is None:
-            self._value = bytes(self.view)
-        elif self._value is None:
-            try:
-                self._value = str(self.view, self.encoding, "surrogatepass" if self.encoding == "utf-8" else "strict")
-            except UnicodeDecodeError:
-                raise PickleError("holds text that cannot be decoded") from None
+        """The text, or the bytes if it is none; kept, so that it costs once, wherever the file refers to it."""
+        if self._value is None:
+            self._value = self.decoded()
         return self._value
+
+    def decoded(self) -> str | bytes:
+        """Return the text, or the bytes if it is none."""
+        if self.encoding is None:
+            return bytes(self.view)
+        try:
+            return str(self.view, self.encoding, "surrogatepass" if self.encoding == "utf-8" else "strict")
+        except UnicodeDecodeError:
+            raise PickleError("holds text that cannot be decoded") from None
 
 
 class Call:

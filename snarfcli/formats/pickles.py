@@ -219,10 +219,12 @@ class _Reading:
             raise PickleError("holds text where bytes belong; it is damaged") from None
 
     def make_bytes_from_text(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> bytes:
-        values = [self.value(arg, depth) for arg in args]
-        if len(values) != 2 or state is not None or not isinstance(values[0], str) or values[1] not in ("latin1", "latin-1"):
+        if len(args) != 2 or state is not None or _text(args[1]) not in ("latin1", "latin-1"):
             raise _odd(name)
-        return self.encoded(values[0])
+        text = args[0].decoded() if isinstance(args[0], Raw) else args[0]  # not kept: it may be most of the file
+        if not isinstance(text, str):
+            raise _odd(name)
+        return self.encoded(text)
 
     def make_bytes(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> bytes:
         if args or state is not None:

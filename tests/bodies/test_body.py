@@ -1,4 +1,4 @@
-"""Shape, correctives and skinning, vertex by vertex in plain NumPy; and what a body file may get wrong."""
+"""Shape, correctives and skinning, vertex by vertex in plain NumPy."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from snarfcli.bodies import builtin_body, load_body
-from snarfcli.errors import UserError
+from snarfcli.bodies import builtin_body
 
 
 @pytest.fixture(scope="module")
@@ -113,57 +112,3 @@ def test_wrong_arguments(body):
         body.shaped(torch.zeros(11))
     with pytest.raises(ValueError, match=r"pose: wanted shape \[B, 24, 3\], got \[1, 72\]"):
         body.pose(torch.zeros(1, 72))
-
-
-def tiny_body():
-    """Two bones along y, an octahedron around them."""
-    vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float32)
-    faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
-    upper = np.float32(vertices[:, 1] > 0)
-    return {
-        "v_template": vertices,
-        "f": np.array(faces, np.uint32),
-        "weights": np.stack([1 - upper, upper], 1),
-        "J_regressor": np.full((2, 6), 1 / 6, np.float32),
-        "kintree_table": np.array([[2**32 - 1, 0], [0, 1]], np.uint32),
-        "shapedirs": np.zeros((6, 3, 2), np.float32),
-        "posedirs": np.zeros((6, 3, 9), np.float32),
-    }
-
-
-def test_reads_smpl_style_files(tmp_path):
-    np.savez(tmp_path / "body.npz", **tiny_body())
-    body = load_body(tmp_path / "body.npz", dtype=torch.float64)
-    assert body.parents == (-1, 0) and body.joint_names == ("joint_0", "joint_1")
-    bent = body.pose(torch.tensor([[[0.0, 0, 0], [0, 0, np.pi / 2]]])).vertices[0]
-    torch.testing.assert_close(bent[2], torch.tensor([-1.0, 0, 0], dtype=torch.float64))  # +y turns to -x
-    torch.testing.assert_close(bent[3], torch.tensor([0.0, -1, 0], dtype=torch.float64))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"posedirs": None}, "lacks posedirs"),
-        ({"weights": np.zeros((5, 2), np.float32)}, r"weights has shape \[5, 2\], wanted \[6, 2\]"),
-        ({"posedirs": np.zeros((6, 3, 10), np.float32)}, r"posedirs has shape \[6, 3, 10\], wanted \[6, 3, 9\]"),
-        ({"v_template": np.full((6, 3), np.nan)}, "v_template must hold finite numbers"),
-        ({"weights": np.array("x")}, "weights must hold finite numbers"),
-        ({"f": np.full((8, 3), 6)}, "vertex numbers from 0 to 5"),
-        ({"kintree_table": np.array([[1, -1], [0, 1]])}, "root first"),
-        ({"v_template": np.float32(1)}, "v_template has shape"),
-    ],
-)
-def test_broken_files(tmp_path, change, message):
-    arrays = {key: value for key, value in {**tiny_body(), **change}.items() if value is not None}
-    np.savez(tmp_path / "body.npz", **arrays)
-    with pytest.raises(UserError, match=message) as caught:
-        load_body(tmp_path / "body.npz")
-    assert "\n" not in str(caught.value)
-
-
-def test_missing_and_foreign_files(tmp_path):
-    with pytest.raises(UserError, match="no body at"):
-        load_body(tmp_path / "none.npz")
-    (tmp_path / "model.pkl").write_bytes(b"x")
-    with pytest.raises(UserError, match="is a pickle, which is not read"):
-        load_body(tmp_path / "model.pkl")

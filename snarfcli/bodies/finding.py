@@ -1,0 +1,146 @@
+"""Finding a body model under the names by which people download and rename it."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from snarfcli.errors import UserError
+
+__all__ = ["BODY_KINDS", "GENDERS", "find_body"]
+
+BODY_KINDS = ("smpl", "smplh", "smplx")
+GENDERS = ("female", "male", "neutral")
+
+_TITLES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
+_LETTERS = {"f": "female", "m": "male", "n": "neutral"}
+_SUFFIX = r"\.(?P<suffix>npz|pkl)"
+# A word after the name says how a copy was made, for example `_2020`, `_np`, `_clean`, `_py3`; other words mean other files.
+_COPY = r"(?P<copy>(?:[_.-](?:\d+|v?\d+(?:\.\d+)+|np|clean|cleaned|py3|nochumpy|converted))*)"
+_DOWNLOADED = re.compile(
+    r"basicmodel_(?P<gender>f|m|n|female|male|neutral)_lbs_10_207_0_v(?P<version>\d+\.\d+\.\d+)" + _COPY + _SUFFIX
+)
+_RENAMED = re.compile(r"(?P<kind>smplh|smplx|smpl)_(?P<gender>female|male|neutral)" + _COPY + _SUFFIX)
+_IN_FOLDER = re.compile(r"model" + _SUFFIX)
+_FOLDER_OF_KIND = re.compile(r"(smplh|smpl\+h|smplx|smpl-x|smpl-h|smpl)(?![a-z])")
+_NAMES = {
+    "smpl": "basicmodel_{letter}_lbs_10_207_0_v*.pkl, SMPL_{GENDER}.pkl",
+    "smplh": "SMPLH_{GENDER}.pkl, smplh/{gender}/model.npz",
+    "smplx": "SMPLX_{GENDER}.npz, smplx/{gender}/model.npz",
+}
+# Deeper than any release unpacks. The bound on entries keeps a wrongly named place, such as /, from being searched for minutes.
+_MAX_DEPTH = 6
+_MAX_ENTRIES = 100_000
+
+
+@dataclass(frozen=True)
+class _Found:
+    kind: str
+    gender: str
+    version: tuple[int, ...]
+    is_copy: bool
+    path: Path
+    depth: int
+
+    @property
+    def preference(self) -> tuple:
+        version = tuple(-part for part in self.version) or (0,)
+        is_pickle = self.path.suffix.lower() == ".pkl"
+        return BODY_KINDS.index(self.kind), version, self.is_copy, is_pickle, self.depth, str(self.path)
+
+
+def find_body(place: str | Path, kind: str | None, gender: str) -> Path:
+    """Find the body model of a gender.
+
+    Of several files the first is taken in this order: SMPL, SMPL-H, SMPL-X (unless `kind` says which); the highest version in
+    the name; the name as downloaded before one marked as a copy; `.npz` before `.pkl`; the one less deep; alphabetically.
+
+    Args:
+        place: a model file, which is taken as it is; or a folder, in which and below which (six levels) is searched for the
+            names of the releases, in upper or lower case: `basicmodel_f_lbs_10_207_0_v1.1.0.pkl`, `SMPL_FEMALE.pkl`,
+            `smplh/female/model.npz`, `SMPLX_FEMALE.npz` and conversions of them.
+        kind: smpl, smplh, smplx, or None for any.
+        gender: female, male or neutral, in upper or lower case, or its first letter.
+
+    Returns:
+        The file. It is never one of another gender.
+
+    Raises:
+        UserError: the place does not exist or holds no such model (the message says what was found), or the kind or gender is
+            none of these.
+    """
+    place = Path(place).expanduser()
+    wanted = _LETTERS.get(gender.strip().lower()[:1], "")
+    if not gender.strip() or not wanted.startswith(gender.strip().lower()):
+        raise UserError(f"body gender {gender!r:.40} is not known; wanted {', '.join(GENDERS)}")
+    if kind is not None and kind not in BODY_KINDS:
+        raise UserError(f"body kind {kind!r:.40} is not known; wanted {', '.join(BODY_KINDS)}")
+    if place.is_file():
+        return place
+    if not place.is_dir():
+        raise UserError(f"no body model at {place}; name a model file or the folder with them")
+    found = sorted(_search(place), key=lambda one: one.preference)
+    for one in found:
+        if one.gender == wanted and kind in (None, one.kind):
+            return one.path
+    title = _TITLES[kind] if kind else "body"
+    names = ", ".join(names for of, names in _NAMES.items() if kind in (None, of))
+    names = names.format(letter=wanted if wanted == "neutral" else wanted[0], gender=wanted, GENDER=wanted.upper())
+    there = ", ".join(str(one.path.relative_to(place)) for one in found[:6]) + (", ..." if len(found) > 6 else "")
+    raise UserError(
+        f"no {wanted} {title} model in {place}; looked for {names}, and found {there or 'no model at all'}; "
+        "download it, or name a model file"
+    )
+
+
+def _search(place: Path) -> Iterator[_Found]:
+    for path, depth in _files(place):
+        name = path.name.lower()
+        folders = [part.lower() for part in Path(os.path.abspath(path)).parent.parts[::-1]]
+        if match := _DOWNLOADED.fullmatch(name):
+            version = tuple(int(part) for part in match["version"].split("."))
+            gender = _LETTERS[match["gender"][0]]
+            yield _Found("smpl", gender, version, bool(match["copy"]), path, depth)
+        elif match := _RENAMED.fullmatch(name):
+            yield _Found(match["kind"], match["gender"], (), bool(match["copy"]), path, depth)
+        elif _IN_FOLDER.fullmatch(name) and folders and folders[0] in GENDERS and (kind := _kind_of(folders[1:])):
+            yield _Found(kind, folders[0], (), False, path, depth)
+
+
+def _kind_of(folders: list[str]) -> str | None:
+    """Return which model the nearest folder is named after; `dmpls` holds soft tissue under the same file names."""
+    for folder in folders:
+        if folder.startswith("dmpl"):
+            return None
+        if match := _FOLDER_OF_KIND.match(folder):
+            return match[1].replace("+", "").replace("-", "")
+    return None
+
+
+def _files(place: Path) -> Iterator[tuple[Path, int]]:
+    """Yield the files in a folder and below, with their depth; links to folders are followed, but no folder is read twice."""
+    seen: set[str] = set()
+    waiting = [(place, 0)]
+    entries = 0
+    while waiting:
+        folder, depth = waiting.pop(0)
+        real = os.path.realpath(folder)
+        if real in seen:
+            continue
+        seen.add(real)
+        try:
+            content = sorted(folder.iterdir())
+        except OSError:  # not ours to read
+            continue
+        for path in content:
+            entries += 1
+            if entries > _MAX_ENTRIES:
+                raise UserError(f"folder {place} holds over {_MAX_ENTRIES:,} files; name the folder with the body models")
+            if path.suffix.lower() in (".npz", ".pkl"):
+                if path.is_file():
+                    yield path, depth
+            elif depth < _MAX_DEPTH and path.is_dir():
+                waiting.append((path, depth + 1))

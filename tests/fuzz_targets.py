@@ -187,3 +187,19 @@ def body_npz() -> Target:
         return saved(damaged_arrays(rng, {**octahedron(), "joint_names": np.array(["a", "b"])}))
 
     return Target("body_npz", ".npz", lambda: [saved(octahedron()), saved(toy(3, 4, vertices=8))], load_body, extra)
+
+
+@_target
+def skeleton() -> Target:
+    """Skeletons and poses as users write them, in JSON."""
+    from skeleton_damage import damaged_json, read_both, seeds_json
+
+    return Target("skeleton", ".json", seeds_json, read_both, damaged_json)
+
+
+@_target
+def skeleton_npz() -> Target:
+    """The same in archives."""
+    from skeleton_damage import damaged_npz, read_both, seeds_npz
+
+    return Target("skeleton_npz", ".npz", seeds_npz, read_both, damaged_npz)

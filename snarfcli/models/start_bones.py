@@ -15,7 +15,9 @@ _PAPERS_BONES = ("pelvis", "l_hip", "r_hip", "l_knee", "r_knee", "l_shoulder", "
 
 
 def with_start_bones(search: SearchConfig, skeleton: Skeleton) -> SearchConfig:
-    """Return the search with start bones of the skeleton: an empty list becomes the papers' nine, or all where it is not SMPL's.
+    """Return the search with the start bones of a skeleton.
+
+    An empty list becomes the papers' nine bones where the joints are SMPL's, and all bones elsewhere.
 
     Raises:
         UserError: a bone is given that the skeleton has not.

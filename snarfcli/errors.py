@@ -18,4 +18,4 @@ class UserError(ValueError):
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return `"; did you mean 'x'?"` for the valid name closest to `name`, or an empty string where none is close."""
     match = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
-    return f"; did you mean '{match[0]}'?" if match else ""
+    return f"; did you mean {match[0][:60]!r}?" if match else ""  # names from files may hold anything

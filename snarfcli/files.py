@@ -85,6 +85,10 @@ def read_json(path: str | Path, what: str = "file") -> Any:
         raise UserError(f"no {what} at {path}") from None
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise UserError(f"{what} {path} is not valid JSON ({error}); make it again") from None
+    except RecursionError:
+        raise UserError(f"{what} {path} is not valid JSON (nested too deeply); make it again") from None
+    except IsADirectoryError:
+        raise UserError(f"{what} {path} is a folder; name a file") from None
 
 
 def read_npz(

@@ -19,6 +19,9 @@ __all__ = [
 # How far from a joint its frame is compared, metres: about the size of a hand, so that turns and scale show as lengths.
 _REACH_M = 0.1
 
+# Matrices with M^T M this close to the identity are turned into rotations by iteration.
+_NEARLY_A_ROTATION = 0.05
+
 # Below this squared angle the series to t^8 is used: its first missing term, t^10 / 11!, is then under 3e-18.
 _SMALL_ANGLE_SQUARED = 1e-2
 
@@ -162,13 +165,21 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
     """
     eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
     error = (matrix.transpose(-1, -2) @ matrix - eye).abs().amax((-1, -2))
-    is_off = (error > 64 * torch.finfo(matrix.dtype).eps) | (torch.linalg.det(matrix) < 0)
+    is_proper = torch.linalg.det(matrix) > 0
+    is_near = is_proper & (error < _NEARLY_A_ROTATION)
     rotation = matrix.clone()
-    if is_off.any():  # the decomposition takes long, and most matrices are rotations
-        u, _, vh = torch.linalg.svd(matrix[is_off])
+    polished = matrix[is_near & (error > 64 * torch.finfo(matrix.dtype).eps)]
+    if len(polished):
+        # Newton's iteration for the polar factor: the error falls as 0.05, 2e-3, 3e-6, 5e-12, 0. Rotations kept as float32 take
+        # this way, a hundred times faster than the decomposition.
+        result = polished
+        for _ in range(4):
+            result = result @ (1.5 * eye - 0.5 * result.transpose(-1, -2) @ result)
+        rotation[is_near & (error > 64 * torch.finfo(matrix.dtype).eps)] = result
+    if not is_near.all():
+        u, _, vh = torch.linalg.svd(matrix[~is_near])
         sign = torch.linalg.det(u @ vh)
-        u = torch.cat([u[..., :2], u[..., 2:] * sign[..., None, None]], -1)
-        rotation[is_off] = u @ vh
+        rotation[~is_near] = torch.cat([u[..., :2], u[..., 2:] * sign[..., None, None]], -1) @ vh
     return rotation
 
 

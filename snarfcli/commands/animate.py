@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from omegaconf import MISSING
 
+from snarfcli.bodies import Skeleton
 from snarfcli.checks import check_choice, check_number
 from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject
 from snarfcli.datasets.settings import DataConfig
@@ -27,8 +28,9 @@ from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import SURFACES, canonical_surface
 from snarfcli.models.avatar import Avatar
-from snarfcli.motions import Motion, builtin_motion
-from snarfcli.motions.amass import read_motion
+from snarfcli.motions import Motion, builtin_motion, read_motion
+from snarfcli.motions.layouts import HANDS, SMPL, layout_of
+from snarfcli.motions.world import UPS
 from snarfcli.runs import choose_device, find_avatar, machine_facts, run_folder, set_threads
 
 __all__ = ["AnimateConfig", "run"]
@@ -57,9 +59,15 @@ class AnimateConfig:
     ckpt: str | None = MISSING
     """Avatar file or run folder to use instead; results go beside it."""
     pose: str | None = MISSING
-    """AMASS-style .npz file with the motion; null for the built-in `motion`."""
+    """Motion: .npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf, or a folder of frames; null for the built-in `motion`."""
     up: str = MISSING
     """Which way is up in the pose file: auto, y or z."""
+    hands: str = MISSING
+    """SMPL's hand joints where the pose file has fingers: rest (straight) or released (as the released code took them)."""
+    mapping: str | None = MISSING
+    """For .bvh and .glb: JSON file {joint of the avatar: joint of the pose file}; null goes by the usual names."""
+    clip: str | None = MISSING
+    """For .bvh and .glb: name or number of the animation; null for the first."""
     motion: str = MISSING
     """Built-in motion, such as jumping_jacks, if there is no pose file."""
     motion_seed: int = MISSING
@@ -122,7 +130,7 @@ def run(config: AnimateConfig) -> int:
     device = choose_device(config.device)
     set_threads(config.threads)
     avatar = Avatar.load(path, device)
-    whole = _read(config, avatar.skeleton.num_joints)
+    whole = _read(config, avatar.skeleton)
     motion, numbers = _selected(config, whole)
     folder = Path(config.output) if config.output else path.parent / "animation" / _file_name(motion.name)
     settings = _settings(config, path, whole, numbers)
@@ -172,7 +180,7 @@ def run(config: AnimateConfig) -> int:
 
 def _check(config: AnimateConfig) -> tuple[int, int]:
     """Refuse settings that cannot be used, before any work starts; return the size of the video."""
-    for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("up", ("auto", "y", "z"))):
+    for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("up", UPS), ("hands", HANDS)):
         check_choice(name, getattr(config, name), choices)
     for name, least in (("step", 1), ("max_frames", 1), ("motion_seed", 0)):
         check_number(name, getattr(config, name), least)
@@ -192,14 +200,17 @@ def _check(config: AnimateConfig) -> tuple[int, int]:
     return numbers
 
 
-def _read(config: AnimateConfig, joints: int) -> Motion:
+def _read(config: AnimateConfig, skeleton: Skeleton) -> Motion:
     """Return the whole motion, with y up."""
     if config.pose is not None:
-        return read_motion(config.pose, joints, up=config.up)
+        return read_motion(
+            config.pose, skeleton, up=config.up, hands=config.hands, mapping=config.mapping, clip=config.clip
+        )
     motion = builtin_motion(config.motion, config.motion_seed, frame_rate=config.motion_frame_rate)
-    if motion.poses.shape[1] != joints:
+    if layout_of(skeleton) != SMPL:
         raise UserError(
-            f"motion {motion.name} has {motion.poses.shape[1]} joints, the avatar has {joints}; give a pose file of its own"
+            f"motion {motion.name} is for SMPL's 24 joints, the avatar has {skeleton.num_joints} of another kind;"
+            " give a motion of its own by --pose FILE, such as .bvh, .glb or .npz"
         )
     return motion
 

@@ -22,8 +22,8 @@ __all__ = ["read_bvh"]
 log = logging.getLogger(__name__)
 
 _DEFAULT_FRAME_RATE = 60.0
-# World transforms take 128 bytes a joint and frame: 384 MiB for a quarter of an hour of 30 joints at 120 frames a second.
-_MOST_JOINT_FRAMES = 3 * 2**20
+# World transforms take 128 bytes a joint and frame: 256 MiB for ten minutes of 30 joints at 120 frames a second.
+_MOST_JOINT_FRAMES = 2**21
 _MOST_JOINTS = 5000
 _LONGEST_LINE = 2**20
 _CHANNEL = re.compile(r"([xyz])(position|rotation)", re.IGNORECASE)

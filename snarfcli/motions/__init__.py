@@ -1,7 +1,16 @@
-"""Pose sequences: AMASS-style files and the built-in motions."""
+"""Pose sequences: files of many kinds and the built-in motions."""
 
-from snarfcli.motions.amass import read_motion
 from snarfcli.motions.builtin import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, builtin_motion
 from snarfcli.motions.motion import Motion
+from snarfcli.motions.reader import MOTION_SUFFIXES, read_motion
+from snarfcli.motions.shape import read_shape
 
-__all__ = ["OUT_OF_DISTRIBUTION_SEQUENCES", "TRAINING_SEQUENCES", "Motion", "builtin_motion", "read_motion"]
+__all__ = [
+    "MOTION_SUFFIXES",
+    "OUT_OF_DISTRIBUTION_SEQUENCES",
+    "TRAINING_SEQUENCES",
+    "Motion",
+    "builtin_motion",
+    "read_motion",
+    "read_shape",
+]

@@ -1,0 +1,130 @@
+"""Which joint of a file moves which joint of a skeleton."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from snarfcli.bodies import Skeleton
+from snarfcli.errors import UserError, nearest
+from snarfcli.files import read_json
+from snarfcli.formats.rig import Rig
+from snarfcli.motions.joint_names import BodyParts, find_body_parts, plain_name
+
+__all__ = ["map_joints"]
+
+_REQUIRED = ("pelvis", "l_hip", "r_hip", "l_knee", "r_knee", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow")
+_MOST_LETTERS = 280  # of the names in a message
+
+
+def map_joints(
+    skeleton: Skeleton, rig: Rig, path: Path, mapping: str | Path | Mapping[str, str | None] | None = None
+) -> dict[int, int]:
+    """Return which joint of the rig moves which joint of the skeleton, by number; joints without one are left out.
+
+    If the rig has every name of the skeleton, names decide. Otherwise joints are paired as parts of a human body, the joints of
+    the spine from both ends, and what is left by name. `mapping` overrules both.
+
+    Args:
+        skeleton: the target.
+        rig: the source.
+        path: its file, for messages.
+        mapping: {joint of the skeleton: joint of the file, or None to leave it straight}, or a JSON file of that.
+
+    Raises:
+        UserError: too few joints are understood, or the mapping names a joint that is not there.
+    """
+    exact = {name: joint for joint, name in enumerate(rig.names)}
+    sources = _Names(rig.names)
+    pairs: dict[int, int] = {}
+    if all(name in exact for name in skeleton.names):
+        pairs = {joint: exact[name] for joint, name in enumerate(skeleton.names)}
+    else:
+        target, source = find_body_parts(skeleton.names, skeleton.parents), find_body_parts(rig.names, rig.parents)
+        pairs = _pair_parts(target, source)
+        missing = [part for part in _REQUIRED if part in target.joints and part not in source.joints]
+        if mapping is None and (missing or not pairs):
+            what = f"no joint for {', '.join(missing)}" if missing else "no joint of the skeleton"
+            raise UserError(
+                f"{path} has {what} in it; give mapping=FILE.json with {{\"joint of the skeleton\": \"joint of the file\"}};"
+                f" the skeleton has {_listed(skeleton.names)}; the file has {_listed(rig.names)}"
+            )
+        for joint, name in enumerate(skeleton.names):
+            number = sources.find(name)
+            if joint not in pairs and number is not None and number not in pairs.values():
+                pairs[joint] = number
+    if mapping is not None:
+        _overrule(pairs, mapping, skeleton, rig, path)
+    if 0 not in pairs:
+        pairs[0] = 0
+    return dict(sorted(pairs.items()))
+
+
+class _Names:
+    """Joints by name: as written, or else in any spelling that only one of them has."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.exact = {name: joint for joint, name in enumerate(names)}
+        plain = [plain_name(name) for name in names]
+        counts = Counter(plain)
+        self.plain = {name: joint for joint, name in enumerate(plain) if name and counts[name] == 1}
+
+    def find(self, name: str) -> int | None:
+        return self.exact.get(name, self.plain.get(plain_name(name)))
+
+
+def _pair_parts(target: BodyParts, source: BodyParts) -> dict[int, int]:
+    pairs = {joint: source.joints[part] for part, joint in target.joints.items() if part in source.joints}
+    few, many = sorted((target.spine, source.spine), key=len)
+    # The ends of the spine carry hips and shoulders; those between are shared out evenly.
+    last = len(many) - 1
+    picks = [round(number * last / (len(few) - 1)) for number in range(len(few))] if len(few) > 1 else [0] * len(few)
+    for number, pick in enumerate(picks):
+        at, of = (number, pick) if few is target.spine else (pick, number)
+        pairs[target.spine[at]] = source.spine[of]
+    return pairs
+
+
+def _overrule(
+    pairs: dict[int, int], mapping: str | Path | Mapping[str, str | None], skeleton: Skeleton, rig: Rig, path: Path
+) -> None:
+    """Put the user's pairs in place of those found."""
+    where = "mapping"
+    if not isinstance(mapping, Mapping):
+        where = f"mapping {mapping}"
+        mapping = read_json(mapping, "mapping")
+    is_good = isinstance(mapping, Mapping) and all(
+        isinstance(key, str) and (value is None or isinstance(value, str)) for key, value in mapping.items()
+    )
+    if not is_good:
+        raise UserError(f'{where} must be {{"joint of the skeleton": "joint of the file" or null, ...}}')
+    targets, sources = _Names(skeleton.names), _Names(rig.names)
+    for target_name, source_name in mapping.items():
+        target = targets.find(target_name)
+        if target is None:
+            raise UserError(
+                f"{where}: the skeleton has no joint {target_name!r:.60}{nearest(target_name, skeleton.names)}"
+                f" It has {_listed(skeleton.names)}"
+            )
+        if source_name is None:
+            pairs.pop(target, None)
+            continue
+        source = sources.find(source_name)
+        if source is None:
+            raise UserError(
+                f"{where}: {path} has no joint {source_name!r:.60}{nearest(source_name, rig.names)}"
+                f" It has {_listed(rig.names)}"
+            )
+        pairs[target] = source
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names for a message, some of many, whatever characters they hold."""
+    shown: list[str] = []
+    for name in names:
+        name = name[:40] if name.isprintable() else ascii(name[:40])[1:-1]
+        if sum(map(len, shown)) + len(name) > _MOST_LETTERS:
+            return ", ".join(shown) + f" and {len(names) - len(shown)} more"
+        shown.append(name)
+    return ", ".join(shown)

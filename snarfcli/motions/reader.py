@@ -1,0 +1,181 @@
+"""One reader for all files of motion."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, legs_apart_pose
+from snarfcli.errors import UserError
+from snarfcli.files import read_npy, read_npz
+from snarfcli.formats.bvh import read_bvh
+from snarfcli.formats.pickles import read_pickle
+from snarfcli.formats.rig import Rig
+from snarfcli.motions.anatomy import JOINTS_REST, PARENTS
+from snarfcli.motions.arrays import MAX_POSE_BYTES, POSE_KEYS, motion_from_arrays
+from snarfcli.motions.layouts import HANDS
+from snarfcli.motions.motion import Motion
+from snarfcli.motions.retarget import choose_clip, retarget
+from snarfcli.motions.world import UPS, Up
+
+__all__ = ["MOTION_SUFFIXES", "read_motion"]
+
+_ARRAY_SUFFIXES = (".npz", ".npy", ".pkl", ".pickle")
+_RIG_SUFFIXES = (".bvh", ".glb", ".gltf")
+MOTION_SUFFIXES = (*_ARRAY_SUFFIXES, *_RIG_SUFFIXES)
+"""Endings of the files that are read, in lower case."""
+_MOST_FILES = 100_000  # of a folder with one pose each: half an hour at 60 frames a second
+
+
+def read_motion(
+    path: str | Path,
+    skeleton: Skeleton | None = None,
+    *,
+    up: Up = "auto",
+    hands: str = "rest",
+    mapping: str | Path | Mapping[str, str | None] | None = None,
+    clip: str | int | None = None,
+) -> Motion:
+    """Read a motion as poses of one skeleton, whatever kind of file it comes from.
+
+    | file | content |
+    |---|---|
+    | `.npz` | AMASS, old and new (SMPL-H, SMPL-X), or plain arrays `poses` or `pose` |
+    | `.npy` | poses, one array |
+    | `.pkl` | AIST++; nothing in it is executed |
+    | folder | one `.npz` a frame with `pose` and perhaps `trans` or `transl`, as of CAPE and the papers' demo; 1, 2, 10 |
+    | `.bvh`, `.glb`, `.gltf` | joints of any program, by their names |
+
+    Args:
+        path: file or folder.
+        skeleton: whose poses are wanted; SMPL's 24 joints by default. Arrays are carried over between SMPL, SMPL-H and SMPL-X
+            joint by joint: hands and face where both have them, straight otherwise. A skeleton of another kind takes 3 values a
+            joint as they are. Poses of rigs are retargeted: bone directions and the height of the hips decide.
+        up: which way is up in the file. `auto`: z for AMASS's, y for AIST++; y for other arrays without a translation, and the
+            axis along which the body stands for those with one and for rigs.
+        hands: what SMPL's two hand joints do where an array has fingers in their place: `rest`, straight, or `released`,
+            values 66 to 72, as in the training data of the released code.
+        mapping: for rigs, which joint of the file moves which of the skeleton: {target: source}, or a JSON file of that. What
+            it does not name is found by name; null leaves a joint straight.
+        clip: for rigs, the name or number of the clip; the first by default.
+
+    Returns:
+        The motion in a world with y up, facing as in the file, named after it.
+
+    Raises:
+        UserError: the file is missing, of another kind, damaged, or does not fit the skeleton; the message says how.
+        ValueError: `up` or `hands` is none of the choices.
+    """
+    if up not in UPS:
+        raise ValueError(f"up: wanted 'auto', 'y' or 'z', got {up!r}")
+    if hands not in HANDS:
+        raise ValueError(f"hands: wanted 'rest' or 'released', got {hands!r}")
+    path = Path(path)
+    skeleton = _smpl_skeleton() if skeleton is None else skeleton
+    suffix = path.suffix.lower()
+    if suffix in _RIG_SUFFIXES and not path.is_dir():
+        rig = _read_rig(path, suffix)
+        chosen = choose_clip(rig, clip, path)
+        name = path.stem if len(rig.clips) == 1 else f"{path.stem}_{chosen.name}"
+        return retarget(rig, chosen, skeleton, path=path, name=name, up=up, mapping=mapping)
+    for setting, value in (("mapping", mapping), ("clip", clip)):
+        if value is not None:
+            raise UserError(f"{setting} is for {', '.join(_RIG_SUFFIXES)} files, got pose file {path}; leave it out")
+    arrays = _read_arrays(path, suffix)
+    name = path.name if path.is_dir() else path.stem
+    return motion_from_arrays(arrays, skeleton, path, name=name, up=up, hands=hands)
+
+
+def _smpl_skeleton() -> Skeleton:
+    rest = torch.from_numpy(JOINTS_REST)
+    return Skeleton(SMPL_JOINT_NAMES, PARENTS, rest, legs_apart_pose(SMPL_JOINT_NAMES, rest.dtype))
+
+
+def _read_rig(path: Path, suffix: str) -> Rig:
+    if suffix == ".bvh":
+        return read_bvh(path)
+    from snarfcli.formats.gltf import read_gltf
+
+    return read_gltf(path)
+
+
+def _read_arrays(path: Path, suffix: str) -> dict[str, NDArray]:
+    """Return the arrays of a file or folder, by the names of AMASS and AIST++."""
+    if path.is_dir():
+        return _read_folder(path)
+    if suffix == ".npz":
+        return read_npz(path, "pose file", only=POSE_KEYS, max_bytes=MAX_POSE_BYTES)
+    if suffix == ".npy":
+        return {"poses": read_npy(path, "pose file", max_bytes=MAX_POSE_BYTES)}
+    if suffix in (".pkl", ".pickle"):
+        return _from_pickle(path)
+    if not path.exists():
+        raise UserError(f"no pose file at {path}")
+    raise UserError(f"pose file {path} is of no kind that is read: {', '.join(MOTION_SUFFIXES)}, or a folder of .npz files")
+
+
+def _from_pickle(path: Path) -> dict[str, NDArray]:
+    content = read_pickle(path, "pose file")
+    if not isinstance(content, dict):
+        raise UserError(f"pose file {path} holds {type(content).__name__}, wanted a dict with smpl_poses, as AIST++ has it")
+    arrays = {}
+    for key in POSE_KEYS:
+        value = content.get(key)
+        if isinstance(value, (np.ndarray, int, float)):
+            arrays[key] = np.asarray(value)
+        elif value is not None:
+            raise UserError(f"pose file {path}: {key} holds {type(value).__name__}, wanted an array")
+    return arrays
+
+
+def _read_folder(path: Path) -> dict[str, NDArray]:
+    """Return the poses of a folder with one file a frame, in the order in which people count."""
+    try:
+        files = [file for file in path.iterdir() if file.suffix.lower() == ".npz" and not file.name.startswith(".")]
+    except OSError as error:
+        raise UserError(f"folder {path} cannot be read ({error.strerror or error})") from None
+    if not files:
+        raise UserError(f"folder {path} holds no .npz files; give a pose file, or a folder with one for each frame")
+    if len(files) > _MOST_FILES:
+        raise UserError(f"folder {path} holds {len(files)} .npz files, more than {_MOST_FILES}; give a part of them")
+    files.sort(key=_natural)
+    frames = [_read_frame(file) for file in files]
+    arrays: dict[str, NDArray] = {}
+    for key in dict.fromkeys(key for frame in frames for key in frame):
+        rows = [frame.get(key) for frame in frames]
+        first = next(row for row in rows if row is not None)
+        for file, row in zip(files, rows, strict=True):
+            if row is None or row.shape != first.shape:
+                raise UserError(f"pose file {file}: {key} is missing or has another shape than in other files; repair it")
+        arrays[key] = np.stack(rows) if key in ("pose", "trans") else first
+    return arrays
+
+
+def _read_frame(file: Path) -> dict[str, NDArray]:
+    """Return `pose` [values] and, if they are there, `trans` [3] and a frame rate of one file."""
+    arrays = read_npz(file, "pose file", only=POSE_KEYS, max_bytes=MAX_POSE_BYTES)
+    frame = {}
+    for name, keys in (("pose", ("pose", "poses")), ("trans", ("trans", "transl"))):
+        key = next((key for key in keys if key in arrays), None)
+        if key is None:
+            continue
+        array = arrays[key]
+        if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+            raise UserError(f"pose file {file}: {key} must hold finite numbers; repair or remove the file")
+        if name == "pose" and (array.size > 3 * 1000 or (array.ndim > 1 and array.shape[0] > 1 and array.shape[1] != 3)):
+            raise UserError(f"pose file {file} holds more than one pose; name a file, or give a folder with a pose in each")
+        frame[name] = array.ravel()
+    if "pose" not in frame:
+        raise UserError(f"pose file {file} has no 'pose'; every .npz file of the folder must hold one")
+    return frame | {key: arrays[key] for key in ("mocap_framerate", "mocap_frame_rate", "frame_rate", "fps") if key in arrays}
+
+
+def _natural(file: Path) -> list[tuple[int, int, str]]:
+    """Order 1, 2, 10 as people do."""
+    parts = re.split(r"([0-9]+)", file.name)
+    return [(1, int(part), part) if at % 2 else (0, 0, part) for at, part in enumerate(parts)]

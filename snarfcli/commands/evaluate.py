@@ -75,7 +75,8 @@ def run(config: EvalConfig) -> None:
         UserError: there is no avatar, there are no samples, they do not go together, or a setting cannot be used.
     """
     _check(config)
-    path = find_avatar(config.output_root, config.data.name, config.subject, config.run, config.ckpt)
+    trained_on = config.data.avatars or config.data.name
+    path = find_avatar(config.output_root, trained_on, config.subject, config.run, config.ckpt)
     device = choose_device(config.device)
     set_threads(config.threads)
     seed_everything(config.seed)
@@ -161,15 +162,17 @@ def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None
         )
     for name, wanted in (("subject", store.subject), ("data", store.data)):
         trained_on = avatar.facts.get(name)
-        if trained_on is not None and str(trained_on) != wanted:
+        if trained_on is not None and str(trained_on) not in (wanted, config.data.avatars):
             log.warning("warning: this avatar was trained on %s %s and is evaluated on %s %s", name, trained_on, name, wanted)
 
 
 def _folder_name(config: EvalConfig, avatar: Avatar) -> str:
-    """Return where the results go; those of another search, of another subject or of a part must not replace the whole."""
+    """Return where the results go; those of another search, data set or subject, or of a part, must not replace the whole."""
     parts = ["eval", config.split]
     if config.search is not None:
         parts.append(config.search.name)
+    if avatar.facts.get("data", config.data.name) != config.data.name:
+        parts.append(config.data.name)
     if avatar.facts.get("subject", config.subject) != config.subject:
         parts.append(config.subject)
     if config.max_frames is not None or config.points is not None:

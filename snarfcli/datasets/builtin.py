@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.bodies import SMPL_JOINT_NAMES, Body, builtin_body, load_body
+from snarfcli.bodies import SMPL_JOINT_NAMES, Body, builtin_body, find_body, load_body
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import Split, SubjectData, body_sequence, body_template
 from snarfcli.errors import UserError, nearest
@@ -76,8 +76,6 @@ def load(subject: str, request: Request) -> SubjectData:
     """Make one of the built-in subjects, with the built-in body or with the one that was asked for."""
     if request.body is None:
         return builtin_subject(subject)
-    from snarfcli.bodies import find_body
-
     check_subject(subject)
     path = find_body(request.body, "smpl", _GENDER)
     return builtin_subject(subject, load_body(path), f"body {path}")

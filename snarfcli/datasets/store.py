@@ -52,6 +52,11 @@ SEQUENCE_FILES = ("points.npy", "occupancies.npy", "vertices.npy", "faces.npy", 
 """The files of a sequence besides its description."""
 
 _VALIDATION_SHARE = 0.1
+_ADVICE = {
+    "train": 'run "snarf preprocess" with training sequences',
+    "test": "evaluate out of distribution (--ood), or preprocess held-out sequences (data.test=[NAME])",
+    "ood": "leave out --ood, or preprocess out-of-distribution sequences (data.ood=[NAME]; PosePrior for dfaust)",
+}
 
 
 def samples_folder(root: str | Path, data: str, subject: str) -> Path:
@@ -241,7 +246,9 @@ class SampleStore:
             raise ValueError(f"split: wanted one of {', '.join(SPLITS)}, got {split!r}{nearest(split, SPLITS)}")
         chosen = [sequence for sequence in self._sequences if sequence.split == split]
         if not chosen:
-            raise UserError(f"the samples in {self.folder} have no sequence of split {split}; {_again(self.folder)}")
+            there = ", ".join(dict.fromkeys(sequence.split for sequence in self._sequences))
+            have = f"the samples in {self.folder} have no sequence of split {split}, only of {there}"
+            raise UserError(f"{have}; {_ADVICE[split]}")
         return chosen
 
     def verify(self) -> None:

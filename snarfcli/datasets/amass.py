@@ -1,0 +1,130 @@
+"""AMASS archives: finding sequences in whatever folders they were unpacked to, and the person they are of."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from omegaconf import OmegaConf
+
+from snarfcli.bodies import Body, Skeleton, find_body, load_body
+from snarfcli.datasets.sources import Request
+from snarfcli.datasets.subjects import SequenceSpec, Split, body_sequence
+from snarfcli.errors import UserError
+from snarfcli.motions import read_motion, read_shape
+
+__all__ = ["Person", "amass_sequences", "find_sequences", "find_subjects", "papers_split", "read_person", "walk_files"]
+
+_DEPTH = 7  # archives unpack to at most three folders, which people put into folders of their own
+_OURS = {"processed", "outputs"}
+_KINDS = ("_poses", "_stageii")
+"""How files of the older (SMPL-H) and of the newer release (SMPL-X) end; the papers used the older."""
+
+
+@lru_cache(maxsize=1)
+def papers_split() -> dict:
+    """Return the papers' split: `dfaust` by subject, and `poseprior`."""
+    return OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("dfaust_split.yaml")))  # type: ignore[return-value]
+
+
+def walk_files(root: Path, suffix: str = ".npz") -> Iterator[Path]:
+    """Yield the files with a suffix at or below a folder, in a fixed order; links are followed, up to seven folders deep."""
+    for folder, names, files in os.walk(root, followlinks=True):
+        depth = len(Path(folder).relative_to(root).parts)
+        names[:] = sorted(name for name in names if name not in _OURS and not name.startswith(".")) if depth < _DEPTH else []
+        for file in sorted(files):
+            if file.lower().endswith(suffix):
+                yield Path(folder) / file
+
+
+def find_sequences(root: Path, subject: str, names: Iterable[str]) -> dict[str, Path]:
+    """Return the AMASS files of a subject's sequences that are somewhere below a folder, by name.
+
+    A file counts as the subject's if its name starts with the subject's, or if it lies in a folder of the subject's name:
+    `DFaust_67/50002/50002_hips_poses.npz`, `DFaust/50002/50002_hips_stageii.npz`, `MPI_Limits/03099/op2_poses.npz`.
+    Of several files of one sequence the older release (SMPL-H) comes first, then the one in fewer folders.
+    """
+    wanted = "|".join(map(re.escape, names))
+    pattern = re.compile(rf"({re.escape(subject)}_)?({wanted})({'|'.join(_KINDS)})\.npz", re.IGNORECASE)
+    found: dict[str, list[tuple[int, int, str, Path]]] = {}
+    for path in walk_files(root):
+        match = pattern.fullmatch(path.name)
+        if match and (match[1] or path.parent.name == subject):
+            rank = (_KINDS.index(match[3].lower()), len(path.parts), str(path), path)
+            found.setdefault(match[2].lower(), []).append(rank)
+    return {name: min(ranks)[3] for name, ranks in found.items()}
+
+
+def find_subjects(root: Path, subjects: Iterable[str]) -> tuple[str, ...]:
+    """Return which of some subjects have AMASS files below a folder."""
+    names = {path.name: path.parent.name for path in walk_files(root) if path.stem.lower().endswith(_KINDS)}
+    there = {name.split("_")[0] for name in names} | set(names.values())
+    return tuple(subject for subject in subjects if subject in there)
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """Whose motions they are: a body model in this person's shape."""
+
+    body: Body
+    betas: NDArray[np.float64]
+    """[S] shape parameters."""
+    skeleton: Skeleton
+    sources: tuple[str, ...]
+    """Which files were taken."""
+
+
+def read_person(files: Mapping[str, Path], request: Request) -> Person:
+    """Return the person of some sequences: shape and gender from `shape.npz` beside them or from a sequence, and the body.
+
+    Raises:
+        UserError: there is no body model of this gender, or a file cannot be used.
+    """
+    sequence = next(iter(files.values()))
+    beside = [path.parent / "shape.npz" for path in files.values() if (path.parent / "shape.npz").is_file()]
+    shape = beside[0] if beside else sequence
+    gender, betas = read_shape(shape)
+    path = find_body(request.body or request.data_root, "smpl", gender)
+    body = load_body(path)
+    betas = betas[: min(len(betas), _SMPL_BETAS, body.num_betas)]
+    sources = (f"body {path} ({gender})", f"shape {shape}", f"motions {sequence.parent}")
+    return Person(body, betas, body.skeleton(betas), sources)
+
+
+_SMPL_BETAS = 10  # the papers use the first ten
+
+
+def amass_sequences(
+    files: Mapping[str, Path], splits: Mapping[str, Split], person: Person, hands: str, where: Path
+) -> tuple[list[SequenceSpec], list[tuple[str, str]]]:
+    """Read sequences without their translation, as the papers do.
+
+    Args:
+        files: those that were found, by name.
+        splits: what each wanted sequence is for, by name.
+        person: whose they are.
+        hands: see `read_motion`.
+        where: where the files were looked for.
+
+    Returns:
+        The sequences, and those that are missing or cannot be read, with the reason.
+    """
+    sequences, broken = [], []
+    for name, split in splits.items():
+        if name not in files:
+            broken.append((name, f"there is no file of it below {where}"))
+            continue
+        try:
+            motion = read_motion(files[name], person.skeleton, up="z", hands=hands)
+        except UserError as error:
+            broken.append((name, str(error)))
+            continue
+        motion = replace(motion, name=name, translation=np.zeros_like(motion.translation))
+        sequences.append(body_sequence(name, split, motion, person.body, person.betas))
+    return sequences, broken

@@ -1,0 +1,188 @@
+"""CAPE: sequences of registered meshes of clothed people, one file a frame, with SMPL's topology.
+
+A subject here is a person in one outfit, such as `00032_longshort`. The layout is that of the archive:
+
+    cape_release/sequences/00032/longshort_hips/*.npz     v_posed (6890, 3), pose (72,), transl (3,)
+    cape_release/minimal_body_shape/00032/00032_minimal.npy
+    cape_release/misc/subj_genders.pkl
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from snarfcli.bodies import Body, find_body, load_body
+from snarfcli.datasets.sources import Request
+from snarfcli.datasets.splits import split_sequences
+from snarfcli.datasets.subjects import SequenceSpec, Split, SubjectData, body_template
+from snarfcli.errors import UserError, nearest
+from snarfcli.files import read_npy, read_npz
+from snarfcli.formats.pickles import read_pickle
+from snarfcli.motions import Motion
+from snarfcli.progress import progress
+
+__all__ = ["CapeMeshes", "load", "read_cape_frame", "subjects"]
+
+log = logging.getLogger(__name__)
+
+_FRAME_RATE = 60.0
+_JOINTS = 24
+_FRAME_SHAPES = {"v_posed": (None, 3), "pose": (72,), "transl": (3,)}
+
+
+@dataclass(frozen=True, eq=False)
+class CapeMeshes:
+    """The registered meshes of one sequence, at the origin: without the recording's translation."""
+
+    paths: Sequence[Path]
+    """T files."""
+    faces: NDArray[np.int32]
+    """[F, 3] SMPL's."""
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> tuple[NDArray, NDArray]:
+        frame = read_cape_frame(self.paths[index], int(self.faces.max()) + 1)
+        return frame["v_posed"] - frame["transl"], self.faces
+
+    def chosen(self, frames: NDArray[np.int64]) -> CapeMeshes:
+        return CapeMeshes([self.paths[frame] for frame in frames], self.faces)
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256("\n".join(path.name for path in self.paths).encode()).hexdigest()[:16]
+
+
+def read_cape_frame(path: Path, num_vertices: int) -> dict[str, NDArray[np.float64]]:
+    """Return `v_posed` [V, 3] and `transl` [3], metres, and `pose` [72], radians, of one frame's file.
+
+    Raises:
+        UserError: the file cannot be read, lacks an array, or one does not fit.
+    """
+    arrays = read_npz(path, "CAPE frame")
+    for name, wanted in _FRAME_SHAPES.items():
+        shape = tuple(num_vertices if size is None else size for size in wanted)
+        if name not in arrays:
+            raise UserError(f"CAPE frame {path} has no '{name}'; it holds {', '.join(sorted(arrays)) or 'nothing'}")
+        array = arrays[name]
+        if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
+            raise UserError(f"CAPE frame {path}: {name} must be finite numbers of shape {list(shape)}, got {list(array.shape)}")
+    return {name: arrays[name].astype(np.float64) for name in _FRAME_SHAPES}
+
+
+def subjects(request: Request) -> tuple[str, ...]:
+    """Return the subjects that are there, such as `00032_longshort`.
+
+    Raises:
+        UserError: there are none.
+    """
+    sequences = _release(request) / "sequences"
+    found = {f"{folder.parent.name}_{folder.name.split('_')[0]}" for folder in sequences.glob("*/*_*") if folder.is_dir()}
+    if not found:
+        raise UserError(f"no CAPE sequences in {sequences}; wanted folders such as 00032/longshort_hips; see data/README.md")
+    return tuple(sorted(found))
+
+
+def load(subject: str, request: Request) -> SubjectData:
+    """Return one person in one outfit; frames that cannot be read are left out and listed.
+
+    Raises:
+        UserError: the subject is not there, or its gender, minimal body or body model.
+    """
+    release = _release(request)
+    person, outfit = _person_and_outfit(subject, subjects(request))
+    body, sources = _minimal_body(person, release, request)
+    skeleton = body.skeleton()
+    folders = {
+        folder.name.partition("_")[2]: folder
+        for folder in sorted((release / "sequences" / person).glob(f"{outfit}_*"))
+        if folder.is_dir()
+    }
+    splits = split_sequences(tuple(folders), request.config.test, request.config.ood)
+    steps: Mapping[Split, int] = {
+        "train": request.config.frame_step, "test": request.config.test_frame_step, "ood": request.config.ood_frame_step,
+    }  # fmt: skip
+    sequences, broken = [], []
+    for name, split in progress(splits.items(), total=len(splits), desc=f"reading {subject}", unit="sequences"):
+        try:
+            sequences.append(_sequence(name, split, folders[name], body, max(1, steps[split])))
+        except UserError as error:
+            broken.append((name, str(error)))
+    order = ("train", "test", "ood")
+    sequences.sort(key=lambda spec: order.index(spec.split))
+    template = body_template(body, np.zeros(0), skeleton)
+    name = f"{person}_{outfit}"
+    return SubjectData("cape", name, skeleton, tuple(sequences), template, np.zeros(0), sources, tuple(broken))
+
+
+def _release(request: Request) -> Path:
+    """Return the folder that holds `sequences`."""
+    folder = request.folder
+    places = [folder, folder / "cape_release", *sorted(folder.glob("*/cape_release")), *sorted(folder.glob("*/*/cape_release"))]
+    for place in places:
+        if (place / "sequences").is_dir():
+            return place
+    raise UserError(f"no cape_release/sequences (CAPE) below {folder}; see data/README.md, or give data.folder=FOLDER")
+
+
+def _person_and_outfit(subject: str, known: Sequence[str]) -> tuple[str, str]:
+    """Return the two parts of a subject's name; a person's number alone will do for one outfit."""
+    number, _, outfit = subject.partition("_")
+    number = number.zfill(5) if number.isdigit() else number
+    matches = [name for name in known if name == f"{number}_{outfit}" or (not outfit and name.startswith(f"{number}_"))]
+    if len(matches) != 1:
+        several = f"subject {subject} wears {', '.join(matches)}; name one" if matches else ""
+        raise UserError(several or f"no CAPE subject '{subject}'{nearest(subject, known)}; there is {', '.join(known)}")
+    person, _, outfit = matches[0].partition("_")
+    return person, outfit
+
+
+def _minimal_body(person: str, release: Path, request: Request) -> tuple[Body, tuple[str, ...]]:
+    """Return the SMPL body of a person, with the person's scanned minimal shape as template, and which files were taken."""
+    genders_file = release / "misc" / "subj_genders.pkl"
+    genders = read_pickle(genders_file, "list of genders")
+    gender = genders.get(person) if isinstance(genders, dict) else None
+    gender = gender.decode("latin1", "replace") if isinstance(gender, bytes) else gender
+    if gender not in ("male", "female", "neutral"):
+        raise UserError(f"{genders_file} says no gender of {person} (male, female or neutral); unpack the archive again")
+    path = find_body(request.body or request.data_root, "smpl", gender)
+    body = load_body(path)
+    if body.num_joints != _JOINTS:
+        raise UserError(f"body {path} has {body.num_joints} joints, CAPE's poses are for SMPL's {_JOINTS}; give body=FILE")
+    minimal_file = release / "minimal_body_shape" / person / f"{person}_minimal.npy"
+    minimal = read_npy(minimal_file, "minimal body")
+    if minimal.shape != tuple(body.v_template.shape) or minimal.dtype.kind != "f" or not np.isfinite(minimal).all():
+        wanted = list(body.v_template.shape)
+        raise UserError(f"minimal body {minimal_file} must be finite numbers of shape {wanted}, got {list(minimal.shape)}")
+    body = replace(body, v_template=torch.as_tensor(minimal).to(body.v_template))
+    return body, (f"body {path} ({gender})", f"minimal body {minimal_file}")
+
+
+def _sequence(name: str, split: Split, folder: Path, body: Body, step: int) -> SequenceSpec:
+    """Read every `step`-th frame of a sequence once, to know which can be used."""
+    paths = sorted(folder.glob("*.npz"))
+    poses = np.zeros((max(len(paths), 1), body.num_joints, 3))
+    usable, reasons = [], []
+    for frame in range(0, len(paths), step):
+        try:
+            poses[frame] = read_cape_frame(paths[frame], len(body.v_template))["pose"].reshape(-1, 3)
+            usable.append(frame)
+        except UserError as error:
+            reasons.append(str(error))
+    if not usable:
+        raise UserError(reasons[0] if reasons else f"{folder} holds no .npz file")
+    if reasons:
+        more = f" ({reasons[0]}{', ...' if len(reasons) > 1 else ''})"
+        counts = len(reasons), len(usable) + len(reasons)
+        log.warning("%s: %d of %d frames cannot be read and are left out%s", name, *counts, more)
+    motion = Motion(name, poses, np.zeros((len(poses), 3)), _FRAME_RATE)
+    meshes = CapeMeshes(paths, body.faces.numpy().astype(np.int32))
+    return SequenceSpec(name, split, motion, meshes, frames=np.array(usable))

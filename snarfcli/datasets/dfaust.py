@@ -1,0 +1,79 @@
+"""DFaust from AMASS: the papers' subjects and split, with PosePrior's sequences out of distribution where they are there.
+
+Targets are posed SMPL bodies; soft-tissue motion (dmpls) is left out (SNARF Sec. 4.1).
+"""
+
+from __future__ import annotations
+
+import logging
+
+from snarfcli.datasets.amass import amass_sequences, find_sequences, find_subjects, papers_split, read_person
+from snarfcli.datasets.sources import Request
+from snarfcli.datasets.subjects import Split, SubjectData, body_template
+from snarfcli.errors import UserError, nearest
+
+__all__ = ["load", "require_person_files", "subjects"]
+
+log = logging.getLogger(__name__)
+
+
+def subjects(request: Request) -> tuple[str, ...]:
+    """Return the ids of the papers' subjects that are there.
+
+    Raises:
+        UserError: none is.
+    """
+    known = tuple(papers_split()["dfaust"])
+    found = find_subjects(request.folder, known)
+    if not found:
+        raise UserError(_nothing(f"of the subjects {', '.join(known)}", known[0], request))
+    return found
+
+
+def load(subject: str, request: Request) -> SubjectData:
+    """Return one subject in the papers' split.
+
+    Raises:
+        UserError: the subject is unknown, or there are no files of it, or no body model.
+    """
+    files, splits = require_person_files(subject, request)
+    person = read_person(files, request)
+    hands = request.config.hands
+    sequences, broken = amass_sequences(files, splits, person, hands, request.folder)
+    prior = papers_split()["poseprior"]
+    extremes = find_sequences(request.folder, prior["subject"], prior["ood"])
+    if extremes:
+        more, missing = amass_sequences(extremes, dict.fromkeys(prior["ood"], "ood"), person, hands, request.folder)
+        sequences, broken = sequences + more, broken + missing
+    else:
+        log.warning(
+            "no PosePrior (MPI_Limits) below %s, so no out-of-distribution poses; put it there and run the command again",
+            request.folder,
+        )
+    template = body_template(person.body, person.betas, person.skeleton)
+    return SubjectData(
+        "dfaust", subject, person.skeleton, tuple(sequences), template, person.betas, person.sources, tuple(broken)
+    )
+
+
+def require_person_files(subject: str, request: Request):
+    """Return the files of a subject's sequences, and what each of the papers' sequences is for.
+
+    Raises:
+        UserError: the subject is unknown, or there are no files of it.
+    """
+    split = papers_split()["dfaust"]
+    if subject not in split:
+        raise UserError(f"no DFaust subject '{subject}'{nearest(subject, split)}; there is {', '.join(split)}")
+    splits: dict[str, Split] = dict.fromkeys(split[subject]["train"], "train") | dict.fromkeys(split[subject]["test"], "test")
+    files = find_sequences(request.folder, subject, splits)
+    if not files:
+        raise UserError(_nothing(f"of subject {subject}", subject, request))
+    return files, splits
+
+
+def _nothing(whose: str, subject: str, request: Request) -> str:
+    return (
+        f"no DFaust sequences {whose} below {request.folder}: wanted AMASS files such as "
+        f"DFaust_67/{subject}/{subject}_hips_poses.npz; see data/README.md, or give data.folder=FOLDER"
+    )

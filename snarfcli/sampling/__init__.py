@@ -9,7 +9,7 @@ from snarfcli.sampling.occupancy import (
     ray_parity,
     winding_numbers,
 )
-from snarfcli.sampling.parallel import count_cores, run_in_processes
+from snarfcli.sampling.parallel import Worker, count_cores, interrupts_held_back, run_in_processes
 from snarfcli.sampling.points import (
     CUBE_PADDING,
     BrokenFrame,
@@ -22,6 +22,7 @@ from snarfcli.sampling.points import (
     sample_frames,
     sampling_cube,
     surface_samples,
+    uniform_surface_samples,
 )
 
 __all__ = [
@@ -30,11 +31,13 @@ __all__ = [
     "BrokenFrame",
     "FrameSamples",
     "SamplingSettings",
+    "Worker",
     "check_mesh",
     "count_boundary_edges",
     "count_cores",
     "dequantise",
     "frame_generator",
+    "interrupts_held_back",
     "labels_differ",
     "occupancies",
     "quantise",
@@ -44,5 +47,6 @@ __all__ = [
     "sample_frames",
     "sampling_cube",
     "surface_samples",
+    "uniform_surface_samples",
     "winding_numbers",
 ]

@@ -18,7 +18,7 @@ from typing import Any
 
 from snarfcli.errors import UserError
 
-__all__ = ["count_cores", "run_in_processes"]
+__all__ = ["Worker", "count_cores", "interrupts_held_back", "run_in_processes"]
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 
@@ -28,6 +28,56 @@ def count_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+class Worker:
+    """A fresh single-threaded process that runs a generator function and sends what it yields, item by item.
+
+    It pays no heed to Ctrl-C, which reaches the whole group: whoever started it ends it. When it gets ahead of the one who
+    receives, it waits as soon as the pipe is full (64 kB on Linux).
+    """
+
+    def __init__(self, function: Callable[..., Iterable[Any]], task: tuple[Any, ...], fewer: str = "workers=1") -> None:
+        """Start `function(*task)`; hold interrupts back meanwhile, and until the worker is where it will be ended from.
+
+        Args:
+            function: a module-level generator function; its items must be picklable.
+            task: its arguments, picklable.
+            fewer: how the user asks for fewer workers.
+        """
+        context = multiprocessing.get_context("spawn")
+        self.receiver, sender = context.Pipe(duplex=False)
+        work = pickle.dumps((function, task))  # here, so that a failure to read it there is reported like any other
+        self._process = context.Process(target=_serve, args=(sender, work), daemon=True)
+        self._fewer = fewer
+        with _one_thread():
+            self._process.start()
+        sender.close()
+
+    def receive(self) -> tuple[bool, Any]:
+        """Wait for the next item and return (True, item), or (False, None) after the last one.
+
+        Raises:
+            UserError: the process ended without a word, as when the system kills it for want of memory.
+            Exception: whatever the function raised.
+        """
+        try:
+            kind, item = self.receiver.recv()
+        except (EOFError, OSError):  # before a message, or in the middle of one
+            self._process.join()
+            raise UserError(
+                f"a worker process ended early (exit code {self._process.exitcode}); "
+                f"if memory ran out, try again with fewer workers, for example {self._fewer}"
+            ) from None
+        if kind == "error":
+            raise item
+        return kind == "item", item
+
+    def end(self) -> None:
+        """End the process, whatever it is doing; nothing is left of it afterwards."""
+        self._process.terminate()
+        self._process.join()
+        self.receiver.close()
 
 
 def run_in_processes(
@@ -48,8 +98,7 @@ def run_in_processes(
         Exception: whatever `function` raised. All processes have ended when this, a KeyboardInterrupt or anything else
             leaves here.
     """
-    context = multiprocessing.get_context("spawn")
-    running: dict[Connection, tuple[int, Any]] = {}
+    running: dict[Connection, tuple[int, Worker]] = {}
     numbered = enumerate(tasks)
     exhausted = False
     try:
@@ -59,45 +108,30 @@ def run_in_processes(
                 if number < 0:
                     exhausted = True
                     break
-                receiver, sender = context.Pipe(duplex=False)
-                process = context.Process(target=_serve, args=(sender, function, task), daemon=True)
-                with _interrupts_held_back(), _one_thread():
-                    process.start()
-                    running[receiver] = (number, process)
-                sender.close()
+                with interrupts_held_back():
+                    worker = Worker(function, task)
+                    running[worker.receiver] = number, worker
             if not running:
                 return
             for receiver in wait(list(running)):
-                number, process = running[receiver]
-                try:
-                    kind, item = receiver.recv()
-                except EOFError:
-                    process.join()
-                    raise UserError(
-                        f"a worker process ended early (exit code {process.exitcode}); "
-                        "if memory ran out, try again with fewer workers, for example workers=1"
-                    ) from None
-                if kind == "item":
+                number, worker = running[receiver]
+                has_item, item = worker.receive()
+                if has_item:
                     yield number, item
-                    continue
-                process.join()
-                del running[receiver]
-                receiver.close()
-                if kind == "error":
-                    raise item
+                else:
+                    worker.end()
+                    del running[receiver]
     finally:
-        for _, process in running.values():
-            process.terminate()
-        for receiver, (_, process) in running.items():
-            process.join()
-            receiver.close()
+        for _, worker in running.values():
+            worker.end()
 
 
-def _serve(sender: Connection, function: Callable[..., Iterable[Any]], task: tuple[Any, ...]) -> None:
+def _serve(sender: Connection, work: bytes) -> None:
     """Run one task in the worker and send each item; the parent alone decides what a failure means."""
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends the workers
     try:
+        function, task = pickle.loads(work)
         for item in function(*task):
             sender.send(("item", item))
         sender.send(("done", None))
@@ -114,7 +148,7 @@ def _serve(sender: Connection, function: Callable[..., Iterable[Any]], task: tup
 
 
 @contextlib.contextmanager
-def _interrupts_held_back() -> Iterator[None]:
+def interrupts_held_back() -> Iterator[None]:
     """Let a process start with Ctrl-C blocked, so that an early one prints no trace; ours arrives when this ends."""
     if not hasattr(signal, "pthread_sigmask"):
         yield

@@ -24,6 +24,7 @@ __all__ = [
     "sample_frames",
     "sampling_cube",
     "surface_samples",
+    "uniform_surface_samples",
 ]
 
 CUBE_PADDING = 0.1
@@ -172,22 +173,53 @@ def surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generat
     """
     import pymeshlab
 
-    corners = vertices.astype(np.float64)[faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    if not areas.sum() > 0:
-        raise UserError("mesh has no area, so nothing can be sampled on its surface; leave this frame out")
+    corners, areas = _triangles(vertices, faces)
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), faces.astype(np.int32)))
     meshes.generate_sampling_poisson_disk(samplenum=max(1, round(count * _POISSON_REQUEST)), **_POISSON_OPTIONS)
     points = generator.permutation(meshes.current_mesh().vertex_matrix())[:count]
     missing = count - len(points)
     if missing:
-        chosen = generator.choice(len(faces), missing, p=areas / areas.sum())
-        first, second = generator.random((2, missing, 1))
-        root = np.sqrt(first)  # uniform in a triangle: Osada et al., Shape Distributions, 2002, Eq. 1
-        a, b, c = corners[chosen].transpose(1, 0, 2)
-        points = np.concatenate([points, (1 - root) * a + root * (1 - second) * b + root * second * c])
+        points = np.concatenate([points, _uniform_in_triangles(corners, areas, missing, generator)])
     return points
+
+
+def uniform_surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Return `count` independent points, uniform on a surface: in a fiftieth of the time of `surface_samples`, less even.
+
+    Args:
+        vertices: [V, 3] metres.
+        faces: [F, 3] vertex numbers.
+        count: number of points.
+        generator: draws them.
+
+    Returns:
+        [count, 3] float64, metres.
+
+    Raises:
+        UserError: the surface has no area.
+    """
+    return _uniform_in_triangles(*_triangles(vertices, faces), count, generator)
+
+
+def _triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners [F, 3, 3] of a mesh's triangles and their areas [F]; refuse a mesh without area."""
+    corners = vertices.astype(np.float64)[faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    if not areas.sum() > 0:
+        raise UserError("mesh has no area, so nothing can be sampled on its surface; leave this frame out")
+    return corners, areas
+
+
+def _uniform_in_triangles(
+    corners: np.ndarray, areas: np.ndarray, count: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Return `count` points [count, 3], uniform on triangles."""
+    chosen = generator.choice(len(areas), count, p=areas / areas.sum())
+    first, second = generator.random((2, count, 1))
+    root = np.sqrt(first)  # uniform in a triangle: Osada et al., Shape Distributions, 2002, Eq. 1
+    a, b, c = corners[chosen].transpose(1, 0, 2)
+    return (1 - root) * a + root * (1 - second) * b + root * second * c
 
 
 def sample_frame(

@@ -10,9 +10,15 @@ from torch import Tensor
 
 from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
+from snarfcli.sampling import count_cores
+from snarfcli.training.fresh import DrawnPoints, FreshPoints, draw_steps
+from snarfcli.training.prefetch import Prefetch
 from snarfcli.training.settings import TrainingConfig
 
-__all__ = ["Batch", "FrameBatches", "load_frames"]
+__all__ = ["Batch", "FrameBatches", "FreshBatches", "load_frames", "new_batches"]
+
+
+_MOST_WORKERS = 8  # of those that are not asked for; a batch of the largest preset takes one of them 0.13 s
 
 
 @dataclass
@@ -30,7 +36,7 @@ class Batch:
 
 
 class FrameBatches:
-    """Draw random frames and points; step k gives the same batch in every run with the same seed.
+    """Draw random frames and stored points of them; step k gives the same batch in every run with the same seed.
 
     Args:
         store: processed samples of one subject.
@@ -70,13 +76,62 @@ class FrameBatches:
         poses = [self.sequences[self.frames[index][0]].poses[self.frames[index][1]] for index in chosen]
         return torch.as_tensor(np.stack(poses), dtype=torch.float32, device=self.device)
 
+    def close(self) -> None:
+        """End whatever makes batches ahead of time; the next batch starts it again."""
+
+
+class FreshBatches(FrameBatches):
+    """Draw random frames and points that no other step has; step k gives the same batch in every run with the same seed.
+
+    The points are labelled here if `config.workers` is 0, otherwise ahead of time by processes: so many, or one fewer than
+    there are cores.
+    """
+
+
+    def __init__(self, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> None:
+        super().__init__(store, config, seed, device)
+        self._fresh = FreshPoints(
+            self.sequences,
+            store.manifest["settings"],
+            config.poses_per_step,
+            config.uniform_points,
+            config.surface_points,
+            seed,
+        )
+        workers = config.workers if config.workers is not None else min(_MOST_WORKERS, max(1, count_cores() - 1))
+        self._ahead = Prefetch(draw_steps, (self._fresh,), workers, "training.workers=1") if workers else None
+
+    def batch(self, step: int) -> Batch:
+        """Return the batch of one step, waiting for it where need be.
+
+        Raises:
+            UserError: a mesh cannot be used, or a process ended early. No process is left then.
+        """
+        drawn: DrawnPoints = self._ahead.get(step) if self._ahead else self._fresh.draw(step)
+        picks = [(self.sequences[sequence], frame) for sequence, frame in drawn.frames]
+        return _gather(picks, drawn.points, drawn.occupied, self.device)
+
+    def close(self) -> None:
+        if self._ahead:
+            self._ahead.close()
+
+
+def new_batches(store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> FrameBatches:
+    """Return what makes the batches that `config` asks for; the arguments are those of `FrameBatches`."""
+    return (FreshBatches if config.fresh_points else FrameBatches)(store, config, seed, device)
+
 
 def load_frames(picks: list, device: torch.device) -> Batch:
     """Gather frames, given as tuples (sequence, frame, point indices), into one batch."""
     points = np.stack([sequence.points(frame, index) for sequence, frame, index in picks])
     occupied = np.stack([sequence.occupancies(frame, index) for sequence, frame, index in picks])
-    transforms = np.stack([sequence.bone_transforms[frame] for sequence, frame, _ in picks])
-    pose = np.stack([sequence.poses[frame] for sequence, frame, _ in picks])
+    return _gather([(sequence, frame) for sequence, frame, _ in picks], points, occupied, device)
+
+
+def _gather(frames: list, points: np.ndarray, occupied: np.ndarray, device: torch.device) -> Batch:
+    """Put points [B, N, 3] and labels [B, N] together with the poses of their frames, given as tuples (sequence, frame)."""
+    transforms = np.stack([sequence.bone_transforms[frame] for sequence, frame in frames])
+    pose = np.stack([sequence.poses[frame] for sequence, frame in frames])
     return Batch(
         torch.as_tensor(points, dtype=torch.float32, device=device),
         torch.as_tensor(occupied, dtype=torch.bool, device=device),

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
     points_per_step = config.poses_per_step * (config.uniform_points + config.surface_points)
     paused = 0.0
 
-    with _interrupt_between_steps() as interrupted, _bar(config.steps, first_step) as bar:
+    with closing(trainer.batches), _interrupt_between_steps() as interrupted, _bar(config.steps, first_step) as bar:
         while trainer.step < config.steps:
             recent = [*recent, trainer.advance()][-_LAST_STEPS:]
             step, last = trainer.step, trainer.step == config.steps

@@ -21,6 +21,10 @@ class TrainingConfig:
     """Points of a frame from the uniform half of its samples."""
     surface_points: int = MISSING
     """Points of a frame from the near-surface half of its samples."""
+    fresh_points: bool = MISSING
+    """Draw and label new points in every step, from the meshes in the store, instead of choosing among the stored points."""
+    workers: int | None = MISSING
+    """Processes that make fresh points ahead of time; null: as the cores allow; 0: none. The avatar does not depend on it."""
     learning_rate: float = MISSING
     """Highest learning rate of Adam."""
     final_learning_rate: float = MISSING

@@ -17,7 +17,7 @@ from snarfcli.evaluation.metrics import iou
 from snarfcli.models.avatar import Avatar
 from snarfcli.models.extent import bone_segments
 from snarfcli.precision import PRECISIONS, matmul_precision
-from snarfcli.training.batches import FrameBatches, load_frames
+from snarfcli.training.batches import load_frames, new_batches
 from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
 from snarfcli.training.settings import TrainingConfig
 
@@ -52,7 +52,7 @@ class Trainer:
         self.avatar, self.store, self.config, self.seed, self.device = avatar, store, config, seed, device
         self.model = avatar.model.to(device)
         self.model.train()
-        self.batches = FrameBatches(store, config, seed, device)
+        self.batches = new_batches(store, config, seed, device)
         self.bones = bone_segments(avatar.skeleton).to(device)
         self.joints = avatar.skeleton.canonical_joints.to(device)
         self.joint_targets = joint_weight_targets(avatar.skeleton.parents, config.joint_target).to(device)
@@ -179,9 +179,11 @@ class Trainer:
         Raises:
             UserError: the state belongs to other settings, or does not fit.
         """
+        same = {"workers": self.config.workers}  # steps are the same whatever their number
         ours = self.avatar.to_dict()["config"] | {"training": asdict(self.config), "seed": self.seed}
         try:
-            theirs = state["avatar"]["config"] | {"training": state["training"], "seed": state["seed"]}
+            training = {"fresh_points": False} | state["training"] | same  # runs from before there were any had no such setting
+            theirs = state["avatar"]["config"] | {"training": training, "seed": state["seed"]}
         except (KeyError, TypeError):
             raise UserError(f"{path} is incomplete; start again with overwrite=true") from None
         changed = _differences(theirs, ours)

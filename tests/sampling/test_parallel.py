@@ -56,6 +56,20 @@ def test_a_failure_reaches_the_caller(kind: str, error: type[Exception], message
     assert not multiprocessing.active_children()
 
 
+class _Unreadable:
+    def __reduce__(self):
+        return _refuse, ()
+
+
+def _refuse() -> None:
+    raise UserError("cannot be read there")
+
+
+def test_a_task_that_cannot_be_read_is_reported() -> None:
+    with pytest.raises(UserError, match="cannot be read there"):
+        list(run_in_processes(_count, [(_Unreadable(), 1)], 1))
+
+
 def test_leaving_early_ends_the_workers_and_draws_no_more_tasks() -> None:
     drawn = []
 

@@ -203,3 +203,76 @@ def skeleton_npz() -> Target:
     from skeleton_damage import damaged_npz, read_both, seeds_npz
 
     return Target("skeleton_npz", ".npz", seeds_npz, read_both, damaged_npz)
+
+
+def _surface_target(name: str, suffix: str, seeds: Callable[[], list[bytes]]) -> Target:
+    from snarfcli.formats.surfaces import read_surface
+
+    return Target(name, suffix, seeds, read_surface)
+
+
+@_target
+def surface_obj() -> Target:
+    corners = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    return _surface_target(
+        "surface_obj",
+        ".obj",
+        lambda: [
+            corners + b"f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n",
+            b"# x\r\nmtllib a.mtl\r\no one\r\n" + corners + b"vt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3//1 \\\n4\nf -4 -3 -2\n",
+        ],
+    )
+
+
+@_target
+def surface_off() -> Target:
+    return _surface_target(
+        "surface_off",
+        ".off",
+        lambda: [
+            b"OFF\n4 4 6\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 2 0 3\n",
+            b"COFF 4 2 0 # x\n0 0 0 1 0 0 1\n1 0 0 1 0 0 1\n1 1 0 1 0 0 1\n0 1 0 1 0 0 1\n\n4 0 1 2 3 9 9\n3 0 1 2\n",
+        ],
+    )
+
+
+@_target
+def surface_ply() -> Target:
+    import struct
+
+    head = b"ply\nformat %s 1.0\ncomment TextureFile a.png\nelement vertex 4\nproperty %s x\nproperty %s y\nproperty %s z\n"
+    faces = b"property uchar red\nelement face %d\nproperty list uchar int vertex_indices\nend_header\n"
+
+    def seeds() -> list[bytes]:
+        corners, made = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], []
+        text = b"0 0 0 1\n1 0 0 1\n0 1 0 1\n0 0 1 1\n3 0 2 1\n4 0 1 2 3\n"
+        made.append(head % ((b"ascii",) + (b"float",) * 3) + faces % 2 + text)
+        for order, code, polygons in (
+            (b"binary_little_endian", "<", [(0, 2, 1), (0, 1, 3), (1, 2, 3)]),
+            (b"binary_big_endian", ">", [(0, 2, 1), (0, 1, 3, 2), (1, 2, 3)]),
+        ):
+            content = head % ((order,) + (b"double",) * 3) + faces % len(polygons)
+            content += b"".join(struct.pack(f"{code}3dB", *corner, 7) for corner in corners)
+            made.append(content + b"".join(struct.pack(f"{code}B{len(p)}i", len(p), *p) for p in polygons))
+        return made
+
+    return _surface_target("surface_ply", ".ply", seeds)
+
+
+@_target
+def surface_stl() -> Target:
+    import trimesh
+
+    def seeds() -> list[bytes]:
+        box = trimesh.creation.box()
+        return [box.export(file_type="stl"), box.export(file_type="stl_ascii").encode()]
+
+    return _surface_target("surface_stl", ".stl", seeds)
+
+
+@_target
+def surface_gltf() -> Target:
+    from snarfcli.formats.gltf import read_gltf_surface
+
+    base = gltf()
+    return Target("surface_gltf", ".gltf", base.seeds, read_gltf_surface, base.extra)

@@ -43,22 +43,35 @@ def map_joints(
     else:
         target, source = find_body_parts(skeleton.names, skeleton.parents), find_body_parts(rig.names, rig.parents)
         pairs = _pair_parts(target, source)
-        missing = [part for part in _REQUIRED if part in target.joints and part not in source.joints]
-        if mapping is None and (missing or not pairs):
-            what = f"no joint for {', '.join(missing)}" if missing else "no joint of the skeleton"
-            raise UserError(
-                f"{path} has {what} in it; give mapping=FILE.json with {{\"joint of the skeleton\": \"joint of the file\"}};"
-                f" the skeleton has {_listed(skeleton.names)}; the file has {_listed(rig.names)}"
-            )
         for joint, name in enumerate(skeleton.names):
             number = sources.find(name)
             if joint not in pairs and number is not None and number not in pairs.values():
                 pairs[joint] = number
+        if mapping is None:
+            _check_pairs(pairs, target, source, skeleton, rig, path)
     if mapping is not None:
         _overrule(pairs, mapping, skeleton, rig, path)
     if 0 not in pairs:
         pairs[0] = 0
     return dict(sorted(pairs.items()))
+
+
+def _check_pairs(
+    pairs: dict[int, int], target: BodyParts, source: BodyParts, skeleton: Skeleton, rig: Rig, path: Path
+) -> None:
+    """Refuse a file of which too little is understood: parts of a human body, or half the joints of another skeleton."""
+    missing = [part for part in _REQUIRED if part in target.joints and part not in source.joints]
+    is_human = all(part in target.joints for part in _REQUIRED)
+    if missing:
+        what = f"no joint for {', '.join(missing)}"
+    elif not is_human and 2 * len(pairs) < skeleton.num_joints:
+        what = f"joints for only {len(pairs)} of {skeleton.num_joints}"
+    else:
+        return
+    raise UserError(
+        f'{path} has {what}; give mapping=FILE.json with {{"joint of the skeleton": "joint of the file", ...}};'
+        f" the skeleton has {_listed(skeleton.names)}; the file has {_listed(rig.names)}"
+    )
 
 
 class _Names:

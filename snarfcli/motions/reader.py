@@ -125,7 +125,7 @@ def _from_pickle(path: Path) -> dict[str, NDArray]:
         raise UserError(f"pose file {path} holds {type(content).__name__}, wanted a dict with smpl_poses, as AIST++ has it")
     arrays = {}
     for key in POSE_KEYS:
-        value = content.get(key)
+        value = content.get(key) if key != "gender" else None  # text, as it should be
         if isinstance(value, (np.ndarray, int, float)):
             arrays[key] = np.asarray(value)
         elif value is not None:

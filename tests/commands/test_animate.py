@@ -268,6 +268,20 @@ def test_a_motion_of_another_skeleton_is_refused(config, tmp_path):
         run(replace(config, pose=str(tmp_path / "smpl.npz")))
 
 
+def test_a_bvh_of_the_avatars_own_joints(config, tmp_path):
+    path = tmp_path / "bend.bvh"
+    path.write_text(
+        "HIERARCHY\nROOT joint_0 { OFFSET 0 0 0 CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation\n"
+        f"JOINT joint_1 {{ OFFSET {LENGTH} 0 0 CHANNELS 3 Zrotation Xrotation Yrotation\n"
+        f"End Site {{ OFFSET {LENGTH} 0 0 }} }} }}\n"
+        "MOTION\nFrames: 2\nFrame Time: 0.05\n0 0 0 0 0 0 0 0 0\n0 0 2 0 0 0 0 0 40\n"
+    )
+    assert run(replace(config, pose=str(path), video=False, output=str(tmp_path / "out"))) == 0
+    bounds = [trimesh.load(tmp_path / "out" / f"frame_{frame:06d}.ply", process=False).bounds for frame in range(2)]
+    assert bounds[0][1, 0] == pytest.approx(2 * LENGTH + RADIUS, abs=0.05)
+    assert bounds[1][1, 2] == pytest.approx(2 + RADIUS, abs=0.05) and bounds[1][0, 2] < 2 - 0.25  # bent back about the vertical
+
+
 def test_the_command_line(config, pose_file, capsys):
     arguments = [
         "animate", "--pose", str(pose_file), "up=y", f"output_root={config.output_root}", "resolution=24", "max_frames=2",

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from toy_animal import animal_motion, make_animal
+from toy_animal_files import animal_glb, write_animal_bvh
 from toy_rigs import CMU_NAMES, MIXAMO_NAMES, a_pose, rig_of, write_bvh
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, builtin_body, forward_kinematics
@@ -257,3 +259,36 @@ def test_the_built_in_body_takes_it_too(tmp_path):
     motion = read_motion(path, builtin_body().skeleton())
     assert motion.poses.shape == STANDING.poses.shape and motion.poses.dtype == np.float64
     assert np.abs(motion.translation - STANDING.translation).max() < 0.1  # the two bodies are of about one size
+
+
+@pytest.mark.parametrize("kind", ["glb", "bvh"])
+@pytest.mark.parametrize("clip", ["walk", "sit"])
+def test_an_animals_own_files_give_its_poses_back(tmp_path, kind, clip):
+    animal, motion = make_animal(0.08), animal_motion(clip, 6)
+    skeleton = Skeleton(animal.names, animal.parents, torch.from_numpy(animal.joints), torch.zeros(len(animal.names), 3))
+    path = tmp_path / f"animal.{kind}"
+    if kind == "glb":
+        path.write_bytes(animal_glb(animal, [animal_motion("trot", 3), motion]))
+        back = read_motion(path, skeleton, clip=clip)
+        assert back.name == f"animal_{clip}"
+    else:
+        write_animal_bvh(path, animal, motion)
+        back = read_motion(path, skeleton)
+    # glTF keeps rotations in float32
+    tolerance = 1e-6 if kind == "glb" else 1e-5
+    np.testing.assert_allclose(back.poses[: len(motion.poses)], motion.poses, atol=tolerance)
+    np.testing.assert_allclose(back.translation[: len(motion.poses)], motion.translation, atol=tolerance)
+
+
+def test_a_human_motion_on_an_animal_is_refused_with_its_joints(tmp_path):
+    animal = make_animal(0.08)
+    skeleton = Skeleton(animal.names, animal.parents, torch.from_numpy(animal.joints), torch.zeros(len(animal.names), 3))
+    path = write_bvh(tmp_path / "walk.bvh", rig_of(STANDING.poses, STANDING.translation, CMU_NAMES))
+    message = "joints for only .* of 19; give mapping=FILE.json .*; the skeleton has pelvis, .*; the file has Hips, LeftUpLeg"
+    with pytest.raises(UserError, match=message) as error:
+        read_motion(path, skeleton)
+    assert len(str(error.value)) < 1000
+    mapping = {"pelvis": "Hips", "l_hind_upper": "LeftUpLeg", "l_hind_lower": "LeftLeg", "r_hind_upper": "RightUpLeg"}
+    poses = read_motion(path, skeleton, mapping=mapping).poses
+    assert np.abs(poses[:, animal.names.index("l_hind_lower")]).max() > 0.01
+    np.testing.assert_array_equal(poses[:, animal.names.index("r_hind_lower")], 0)

@@ -276,3 +276,107 @@ def surface_gltf() -> Target:
 
     base = gltf()
     return Target("surface_gltf", ".gltf", base.seeds, read_gltf_surface, base.extra)
+
+
+def _poses(frames: int, width: int):
+    import numpy as np
+
+    return np.linspace(-0.5, 0.5, frames * width, dtype=np.float32).reshape(frames, width)
+
+
+@_target
+def motion_npz() -> Target:
+    import io
+
+    import numpy as np
+
+    from snarfcli.motions import read_motion
+
+    def seeds() -> list[bytes]:
+        old = {"poses": _poses(2, 156), "trans": np.zeros((2, 3)), "mocap_framerate": 120.0, "gender": b"male"}
+        parts = {"root_orient": _poses(3, 3), "pose_body": _poses(3, 63), "pose_hand": _poses(3, 90), "mocap_frame_rate": 60}
+        matrices = {"poses": np.tile(np.eye(3, dtype=np.float32), (1, 24, 1, 1)), "transl": np.ones((1, 3), "f4")}
+        made = []
+        for arrays in (old, parts, matrices, {"pose": _poses(1, 72)[0]}):
+            buffer = io.BytesIO()
+            (np.savez_compressed if arrays is parts else np.savez)(buffer, **arrays)
+            made.append(buffer.getvalue())
+        return made
+
+    return Target("motion_npz", ".npz", seeds, read_motion, _odd_npz)
+
+
+def _odd_npz(rng: random.Random, content: bytes) -> bytes:
+    """Another archive: the arrays of the seed with shapes, types and values that they should not have."""
+    import io
+
+    import numpy as np
+
+    np.seterr(all="ignore")
+    with np.load(io.BytesIO(content)) as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    for _ in range(rng.choice([1, 1, 2, 3])):
+        key = rng.choice(list(arrays))
+        array = arrays[key]
+        kind = rng.randrange(8)
+        if kind == 0:
+            array = array.ravel()
+        elif kind == 1:
+            array = array[None] if rng.random() < 0.5 else array[..., None]
+        elif kind == 2:
+            kinds = ["S4", "U8", "O"] + ["f2", "f8", "i1", "u8", ">f4", "c8", "?"] * (array.dtype.kind == "f")
+            with np.errstate(all="ignore"):
+                array = array.astype(rng.choice(kinds))
+        elif kind == 3:
+            array = np.repeat(array, rng.choice([0, 2, 3]), rng.randrange(array.ndim)) if array.ndim else np.zeros(0)
+        elif kind == 4 and array.dtype.kind == "f":
+            with np.errstate(all="ignore"):
+                array = array * rng.choice([np.nan, np.inf, 1e30, 180.0, 0.0, -1.0, 1e-30])
+        elif kind == 5:
+            array = np.asfortranarray(array.T)
+        elif kind == 6:
+            array = np.zeros(rng.choice([(), (0,), (0, 72), (72, 0), (1, 1, 1, 1), (24, 3), (2, 52, 3), (1, 66), (3, 0, 3, 3)]))
+        else:
+            other = rng.choice(["poses", "pose", "trans", "smpl_scaling", "fps", "root_orient", "pose_body", "smpl_poses"])
+            arrays[other] = array
+            continue
+        arrays[key] = array
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+@_target
+def motion_pkl() -> Target:
+    import pickle
+
+    import numpy as np
+
+    from snarfcli.motions import read_motion
+
+    def seeds() -> list[bytes]:
+        dance = {"smpl_poses": _poses(2, 72), "smpl_trans": np.ones((2, 3)), "smpl_scaling": np.array([93.5]), "smpl_loss": 0.1}
+        plain = {"poses": _poses(1, 72), "trans": np.zeros((1, 3)), "gender": "male"}
+        return [pickle.dumps(dance, 2), pickle.dumps(dance, 4), pickle.dumps(plain, 0), pickle.dumps(plain, 5)]
+
+    return Target("motion_pkl", ".pkl", seeds, read_motion)
+
+
+@_target
+def motion_bvh() -> Target:
+    import tempfile
+    from pathlib import Path
+
+    import numpy as np
+    from toy_rigs import CMU_NAMES, MIXAMO_NAMES, a_pose, rig_of, write_bvh
+
+    from snarfcli.motions import read_motion
+
+    def seeds() -> list[bytes]:
+        poses = _poses(2, 72).reshape(2, 24, 3).astype(np.float64)
+        rigs = [rig_of(poses, np.zeros((2, 3)), CMU_NAMES, scale=100)]
+        rigs.append(rig_of(poses, np.ones((2, 3)), MIXAMO_NAMES, rest_pose=a_pose()))
+        with tempfile.TemporaryDirectory() as folder:
+            return [write_bvh(Path(folder) / "seed.bvh", rig).read_bytes() for rig in rigs]
+
+    return Target("motion_bvh", ".bvh", seeds, read_motion)

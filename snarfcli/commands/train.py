@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 _AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every")
 _NOT_NEGATIVE = (
     "uniform_points", "surface_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight", "joint_weight",
-    "validation_frames", "refresh_cells_every",
+    "validation_frames", "refresh_cells_every", "workers",
 )  # fmt: skip
 
 
@@ -150,8 +150,6 @@ def _check(config: TrainConfig) -> None:
         check_number(f"training.{name}", getattr(training, name), 1)
     for name in _NOT_NEGATIVE:
         check_number(f"training.{name}", getattr(training, name), 0)
-    if training.workers is not None:
-        check_number("training.workers", training.workers, 0)
     if training.uniform_points + training.surface_points == 0:
         raise UserError("training.uniform_points and training.surface_points are both 0; nothing could be learned")
     check_number("training.learning_rate", training.learning_rate, 0, 1)

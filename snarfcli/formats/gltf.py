@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 # Places of nodes in one clip, and of joints in all clips, 128 bytes each.
 _MAX_NODE_FRAMES = 1_500_000
 _MAX_JOINT_FRAMES = 2_000_000
-_MAX_SKINS = 1000
+_MAX_SKIN_JOINTS = 100_000  # of all skins together
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,11 +155,12 @@ def _mesh_of(file: GltfFile, tree: NodeTree, node: int) -> tuple[int, int | None
 def _used_skins(file: GltfFile, meshes: list[tuple[int, int, int | None]]) -> list[int]:
     """Return the skins that move a mesh, all skins where there is no mesh; those with the most joints come first."""
     skins = file.items("skins")
-    if len(skins) > _MAX_SKINS:
-        file.fail(f"has {len(skins)} skins, more than {_MAX_SKINS}; join its meshes")
     used = dict.fromkeys(skin for _, _, skin in meshes if skin is not None) if meshes else range(len(skins))
-    joints = {skin: skins[skin].get("joints") for skin in used}
-    return sorted(used, key=lambda skin: -len(joints[skin]) if isinstance(joints[skin], list) else 0)
+    joints = [skins[skin].get("joints") for skin in used]
+    counts = dict(zip(used, [len(found) if isinstance(found, list) else 0 for found in joints], strict=True))
+    if sum(counts.values()) + 20 * len(counts) > _MAX_SKIN_JOINTS:  # 20: what a skin costs without joints
+        file.fail(f"has {len(counts)} skins of {sum(counts.values())} joints, too many; join its meshes")
+    return sorted(counts, key=lambda skin: -counts[skin])
 
 
 def _read_skin(file: GltfFile, number: int) -> _Skin:

@@ -35,7 +35,7 @@ _MAX_BINARY = 2**29  # bytes, textures included
 _MAX_JSON = 160 * 2**20  # bytes, buffers written into the JSON included
 _MAX_JSON_ITEMS = 2_000_000  # a parsed list or number takes up to 100 bytes
 _MAX_ACCESSOR_VALUES = 2**24  # 128 MiB as float64
-_MAX_VALUES = 2**27  # all accessors together; one that is used twice counts twice
+_MAX_VALUES = 2**26  # all accessors together; one that is used twice counts twice
 
 
 class GltfFile:

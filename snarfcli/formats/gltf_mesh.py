@@ -18,8 +18,9 @@ __all__ = ["MeshReader", "Piece", "dense_weights", "join_pieces", "moved", "weld
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _DRACO = "KHR_draco_mesh_compression"
 _MAX_PRIMITIVES = 10_000
-_MAX_VERTICES = 1_500_000
-_MAX_FACES = 3_000_000
+# Half a GiB and 3 s, with eight joints to each vertex.
+_MAX_VERTICES = 500_000
+_MAX_FACES = 1_000_000
 _MAX_WEIGHTS = 40_000_000  # 320 MB
 
 
@@ -61,14 +62,22 @@ class MeshReader:
             self._primitives += len(primitives)
             if self._primitives > _MAX_PRIMITIVES:
                 file.fail(f"its meshes have over {_MAX_PRIMITIVES} parts; join them")
-            pieces = [_read_primitive(file, primitive, skin_joints, what) for primitive in primitives]
-            self._pieces[number, skin_joints] = join_pieces([piece for piece in pieces if piece is not None])
-        piece = self._pieces[number, skin_joints]
+            pieces = []
+            for primitive in primitives:
+                piece = _read_primitive(file, primitive, skin_joints, what)
+                if piece is not None:
+                    self._count(piece)
+                    pieces.append(piece)
+            self._pieces[number, skin_joints] = join_pieces(pieces)
+        else:
+            self._count(self._pieces[number, skin_joints])
+        return self._pieces[number, skin_joints]
+
+    def _count(self, piece: Piece) -> None:
         self._vertices += len(piece.vertices)
         self._faces += len(piece.faces)
         if self._vertices > _MAX_VERTICES or self._faces > _MAX_FACES:
-            file.fail(f"its meshes have over {_MAX_VERTICES} vertices or {_MAX_FACES} triangles; simplify them")
-        return piece
+            self._file.fail(f"its meshes have over {_MAX_VERTICES} vertices or {_MAX_FACES} triangles; simplify them")
 
 
 def _read_primitive(file: GltfFile, primitive: dict[str, Any], skin_joints: int | None, what: str) -> Piece | None:
@@ -85,6 +94,8 @@ def _read_primitive(file: GltfFile, primitive: dict[str, Any], skin_joints: int 
     if indices is None:
         corners = np.arange(len(vertices))
     else:
+        if file.accessor_shape(indices)[0] > 3 * _MAX_FACES:
+            file.fail(f"{what} has over {_MAX_FACES} triangles; simplify it")
         corners = file.accessor(indices, ("SCALAR",), f"indices of {what}")[:, 0]
         if corners.dtype.kind != "i" or (len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices)):
             file.fail(f"{what} has indices beyond its {len(vertices)} vertices; export it again")

@@ -60,9 +60,9 @@ def read_animations(file: GltfFile, frame_rate: float) -> list[Animation]:
         targets = [target for channel in channels[number] if (target := _target(file, channel, samplers, what))]
         if not targets:
             continue
-        keys = [_read_keys(file, sampler, path, what) for _, path, sampler in targets]
-        start = min(times[0] for times, _, _ in keys)
-        duration = max(times[-1] for times, _, _ in keys) - start
+        times = [_read_times(file, sampler, what) for _, _, sampler in targets]
+        start = min(t[0] for t in times)
+        duration = max(t[-1] for t in times) - start
         if not duration * frame_rate < _MAX_FRAMES:
             file.fail(f"{what} lasts {duration:.6g} s, over {_MAX_FRAMES} frames at {frame_rate:g} a second; cut it")
         frames = int(duration * frame_rate + _EPSILON * frame_rate + 1e-6) + 1
@@ -71,8 +71,9 @@ def read_animations(file: GltfFile, frame_rate: float) -> list[Animation]:
             file.fail(f"its animations have over {_MAX_SAMPLES} samples at {frame_rate:g} frames a second; export fewer")
         at = start + np.minimum(np.arange(frames) / frame_rate, duration)
         nodes: dict[int, dict[str, NDArray[np.float64]]] = {}
-        for (node, path, _), (times, values, mode) in zip(targets, keys, strict=True):
-            sampled = _sample(times, values, mode, at, path == "rotation")
+        for (node, path, sampler), keys in zip(targets, times, strict=True):
+            values, mode = _read_values(file, sampler, path, len(keys), what)
+            sampled = _sample(keys, values, mode, at, path == "rotation")
             if path == "rotation":
                 length = np.linalg.norm(sampled, axis=1, keepdims=True)
                 if not (length > 1e-12).all():
@@ -100,24 +101,32 @@ def _target(
     return node, path, samplers[sampler]
 
 
-def _read_keys(
-    file: GltfFile, sampler: dict[str, Any], path: str, what: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64], str]:
-    """Return times [K], values [K, width] (with tangents, [K, 3, width]) and the interpolation of a sampler."""
+def _read_times(file: GltfFile, sampler: dict[str, Any], what: str) -> NDArray[np.float64]:
+    """Return the times [K] of a sampler's keys, seconds, K > 0."""
+    number = file.index(sampler, "input", "accessors", what)
+    if number is None:
+        file.fail(f"{what} has a sampler without input; export it again")
+    times = file.accessor(number, ("SCALAR",), f"times of {what}")[:, 0].astype(np.float64)
+    if len(times) == 0 or (np.diff(times) < 0).any():
+        file.fail(f"{what} has no times, or times that do not increase; export it again")
+    return times
+
+
+def _read_values(
+    file: GltfFile, sampler: dict[str, Any], path: str, num_keys: int, what: str
+) -> tuple[NDArray[np.float64], str]:
+    """Return the values [K, width] of a sampler (with tangents, [K, 3, width]) and its interpolation."""
     mode = sampler.get("interpolation", "LINEAR")
     if not isinstance(mode, str) or mode not in ("LINEAR", "STEP", "CUBICSPLINE"):
         file.fail(f"{what} has an interpolation that is none of LINEAR, STEP and CUBICSPLINE; export it again")
-    numbers = [file.index(sampler, key, "accessors", what) for key in ("input", "output")]
-    if None in numbers:
-        file.fail(f"{what} has a sampler without input or output; export it again")
-    times = file.accessor(numbers[0], ("SCALAR",), f"times of {what}")[:, 0].astype(np.float64)
-    values = file.accessor(numbers[1], ("VEC4" if path == "rotation" else "VEC3",), f"values of {what}").astype(np.float64)
+    number = file.index(sampler, "output", "accessors", what)
+    if number is None:
+        file.fail(f"{what} has a sampler without output; export it again")
+    values = file.accessor(number, ("VEC4" if path == "rotation" else "VEC3",), f"values of {what}").astype(np.float64)
     each = 3 if mode == "CUBICSPLINE" else 1
-    if len(times) == 0 or len(values) != each * len(times):
-        file.fail(f"{what} has {len(times)} times and {len(values)} values; export it again")
-    if (np.diff(times) < 0).any():
-        file.fail(f"{what} has times that do not increase; export it again")
-    return times, values.reshape(len(times), 3, -1) if each == 3 else values, mode
+    if len(values) != each * num_keys:
+        file.fail(f"{what} has {num_keys} times and {len(values)} values; export it again")
+    return (values.reshape(num_keys, 3, -1) if each == 3 else values), mode
 
 
 def _sample(

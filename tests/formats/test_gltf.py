@@ -367,7 +367,7 @@ _SAMPLER = (0, "samplers", 0)
         (_set("nodes", 0, "scale", [float("nan"), 1, 1]), "3 finite numbers"),
         (_set("nodes", 0, "rotation", [0, 0, 0, 0]), "zero quaternion"),
         (_set("nodes", 0, "translation", [1, 2]), "3 finite numbers"),
-        (_set("accessors", 0, "count", 10**12), "over 1500000 vertices"),
+        (_set("accessors", 0, "count", 10**12), "over 500000 vertices"),
         (_set("accessors", 0, "count", 9), "outside its buffer"),
         (_set("accessors", 0, "count", -1), "whole number"),
         (_set("accessors", 0, "byteOffset", 10**12), "outside its buffer"),

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from snarfcli.bodies import Skeleton, matrix_to_axis_angle
+from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.errors import UserError, nearest
 from snarfcli.formats.rig import Clip, Rig
@@ -121,7 +121,7 @@ def retarget(
             world[:, joint] = world[:, parent] if parent >= 0 else np.eye(3)
             continue
         local = world[:, joint] if parent < 0 else world[:, parent].transpose(0, 2, 1) @ world[:, joint]
-        poses[:, joint] = matrix_to_axis_angle(torch.from_numpy(local)).numpy()
+        poses[:, joint] = Rotation.from_matrix(local).as_rotvec()
     translation = _way(match, clip, world[:, 0], upright)
     if not np.abs(translation).max() < _FARTHEST_M:
         raise UserError(f"{path}: the body goes over {_FARTHEST_M / 1000:g} km away; check the numbers of its root")
@@ -146,7 +146,8 @@ def _turned(rig: Rig, clip: Clip, number: int, path: Path) -> Array:
         moved = moved if 1e-3 < largest < 1e3 else moved / (np.abs(moved).max((1, 2), keepdims=True) + 1e-300)
     if not np.isfinite(moved).all():
         raise UserError(f"{path}: joint {rig.names[number][:40]!r} is scaled beyond all numbers; export it again")
-    return nearest_rotation(torch.from_numpy(moved)).numpy()
+    is_rotation = np.abs(moved.transpose(0, 2, 1) @ moved - np.eye(3)).max() < 1e-12 and np.linalg.det(moved).min() > 0
+    return moved if is_rotation else nearest_rotation(torch.from_numpy(moved)).numpy()
 
 
 # --- where the body goes -----------------------------------------------------------------------------------------------------

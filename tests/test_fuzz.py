@@ -6,6 +6,7 @@ import time
 
 import fuzzing
 import pytest
+from fuzz_damage import DAMAGES
 from fuzz_targets import TARGETS
 from fuzzing import Target, broken_file, check_target
 
@@ -51,7 +52,7 @@ def test_files_are_repeatable_and_differ():
 def test_every_kind_of_damage_works_on_any_bytes():
     import random
 
-    for number, damage in enumerate(fuzzing._DAMAGES):
+    for number, damage in enumerate(DAMAGES):
         for content in (b"", b"x", b"a 1.5\nb -2\n", bytes(range(256))):
             for repeat in range(50):
                 assert isinstance(damage(random.Random(f"{number}{repeat}"), content, b""), bytes)

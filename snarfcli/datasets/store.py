@@ -235,6 +235,11 @@ class SampleStore:
         except (KeyError, TypeError) as error:
             raise UserError(f"the samples are damaged: {folder} lacks {error} or has it otherwise; {_again(folder)}") from None
 
+    @property
+    def all_sequences(self) -> list[SequenceSamples]:
+        """The sequences of all splits, in the order of the data set."""
+        return list(self._sequences)
+
     def sequences(self, split: str) -> list[SequenceSamples]:
         """Return the sequences of one split, in the order of the data set.
 

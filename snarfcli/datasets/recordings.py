@@ -1,0 +1,146 @@
+"""One recorded sequence of a skeleton, in the units and axes of its files, and how it becomes one of the data set."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from snarfcli.bodies import pose_from_transforms
+from snarfcli.bodies.skeleton import Skeleton
+from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
+from snarfcli.datasets.skeleton_files import PoseFile
+from snarfcli.datasets.subjects import SequenceSpec, Split
+from snarfcli.motions import Motion
+
+__all__ = ["PERSON_M", "World", "Recording", "folder_names", "person_scale"]
+
+PERSON_M = 1.8
+"""Longest side that a subject is scaled to: the settings of training hold lengths that fit a person."""
+
+_NEAR_A_PERSON_M = (1.2, 2.4)
+_APART_M = 1e-3  # poses that reproduce the bone transforms to a millimetre are as good as the transforms
+_TEST_SHARE = 0.2  # of the frames of an only sequence
+
+
+@dataclass(frozen=True)
+class World:
+    """From the units and axes of the files to metres and y up."""
+
+    scale: float
+    """Metres a unit."""
+    up: str
+    """Which way is up in the files: y or z."""
+
+    @property
+    def turn(self) -> NDArray[np.float64]:
+        """[3, 3] rotation; z up becomes y up, and what faced -y faces +z."""
+        return np.eye(3) if self.up == "y" else np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """[4, 4] from the files to the world: turned and scaled."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * self.turn
+        return matrix
+
+    def points(self, points: NDArray) -> NDArray[np.float64]:
+        """Return points or offsets [..., 3] of the files, metres."""
+        return self.scale * (np.asarray(points, np.float64) @ self.turn.T)
+
+    def angles(self, axis_angle: NDArray) -> NDArray[np.float64]:
+        """Return axis-angle vectors [..., 3] of the files in the turned axes."""
+        return np.asarray(axis_angle, np.float64) @ self.turn.T
+
+    def transforms(self, transforms: NDArray) -> NDArray[np.float64]:
+        """Return bone transforms [..., 4, 4] of the files, metres."""
+        moved = np.array(transforms, np.float64)
+        moved[..., :3, :3] = self.turn @ moved[..., :3, :3] @ self.turn.T
+        moved[..., :3, 3] = self.points(moved[..., :3, 3])
+        return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A sequence in the units and axes of its files."""
+
+    name: str
+    """Its name, which may be a folder's."""
+    poses: PoseFile
+    """How the skeleton moves."""
+    meshes: FileMeshes | RigMeshes
+    """The mesh of every frame: files that are turned and scaled later on, or a rig that is in the world already."""
+
+    def to_sequence(self, split: Split, skeleton: Skeleton, world: World) -> SequenceSpec:
+        """Return the sequence in the world: poses where they reproduce the transforms, else the transforms too."""
+        poses, posed_from_rest = self.poses, None
+        if poses.posed_from_rest is not None:
+            transforms = world.transforms(poses.posed_from_rest)
+            angles, translation, apart = (
+                array.numpy()
+                for array in pose_from_transforms(torch.from_numpy(transforms), skeleton.parents, skeleton.joints_rest)
+            )
+            posed_from_rest = transforms if apart.max() > _APART_M else None
+        else:
+            angles, translation = world.angles(poses.poses), world.points(poses.translation)
+        motion = Motion(self.name, angles, translation, poses.frame_rate)
+        meshes = self.meshes
+        if isinstance(meshes, FileMeshes):
+            meshes = replace(meshes, world_from_file=world.matrix)
+        return SequenceSpec(self.name, split, motion, meshes, posed_from_rest)
+
+    def halves(self) -> list[Recording]:
+        """Return the sequence without its last fifth, and the last fifth as a sequence of its own; one frame stays whole."""
+        count = self.poses.num_frames
+        if count < 2:
+            return [self]
+        cut = count - max(1, round(_TEST_SHARE * count))
+        return [self._part(self.name, slice(0, cut)), self._part(f"{self.name}_end", slice(cut, count))]
+
+    def _part(self, name: str, frames: slice) -> Recording:
+        arrays = {key: getattr(self.poses, key) for key in ("poses", "translation", "posed_from_rest")}
+        poses = replace(self.poses, **{key: array[frames] for key, array in arrays.items() if array is not None})
+        if isinstance(self.meshes, FileMeshes):
+            return Recording(name, poses, replace(self.meshes, paths=self.meshes.paths[frames]))
+        return Recording(name, poses, replace(self.meshes, posed_from_rest=self.meshes.posed_from_rest[frames]))
+
+
+def person_scale(vertices: NDArray, wanted: str, given: float | None) -> tuple[float, str]:
+    """Return metres a unit, and why.
+
+    Args:
+        vertices: [V, 3] of a mesh, units of its file.
+        wanted: what the user asks for: auto, or a positive number.
+        given: what the skeleton's file says, if it does.
+    """
+    length = float(np.ptp(vertices, axis=0).max())
+    if wanted != "auto":
+        return float(wanted), f"scaled by {float(wanted):g} (data.scale): {float(wanted) * length:.2f} m long"
+    if given is not None:
+        return given, f"scaled by {given:g} (its file): {given * length:.2f} m long"
+    if _NEAR_A_PERSON_M[0] <= length <= _NEAR_A_PERSON_M[1] or not length > 0:
+        return 1.0, f"not scaled: {length:.2f} m long"
+    scale = PERSON_M / length
+    return scale, f"scaled by {scale:.4g}, so that {length:.4g} units become {PERSON_M} m; data.scale=NUMBER sets it"
+
+
+def folder_names(names: Iterable[str]) -> list[str]:
+    """Return names that can be folders on any system, each once, whatever the letter case."""
+    made: list[str] = []
+    for name in names:
+        base = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "clip"
+        base = name = base[:80]
+        number = 1
+        while name.lower() in _lower(made):
+            number += 1
+            name = f"{base}_{number}"
+        made.append(name)
+    return made
+
+
+def _lower(names: Sequence[str]) -> set[str]:
+    return {name.lower() for name in names}

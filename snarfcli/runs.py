@@ -46,7 +46,8 @@ def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str |
     if not (folder / "avatar.pt").is_file():
         trained = sorted(p.parent.name for p in folder.parent.glob("*/avatar.pt"))
         hint = f"; trained runs there: {', '.join(trained)}{nearest(run, trained)}" if trained else ""
-        raise UserError(f'no avatar in {folder}{hint}; run "snarf train subject={subject}" or give ckpt=PATH')
+        chosen = f"subject={subject}" if data == "builtin" else f"data={data} subject={subject}"
+        raise UserError(f'no avatar in {folder}{hint}; run "snarf train {chosen}" or give ckpt=PATH')
     return folder / "avatar.pt"
 
 

@@ -11,13 +11,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from omegaconf import MISSING
 
 from snarfcli.bodies import Skeleton
 from snarfcli.checks import check_choice, check_number
 from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.stored_motion import stored_motion
 from snarfcli.errors import UserError
 from snarfcli.export.animation import Animation
 from snarfcli.export.meshes import MESH_WRITERS
@@ -28,7 +31,7 @@ from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import SURFACES, canonical_surface
 from snarfcli.models.avatar import Avatar
-from snarfcli.motions import Motion, builtin_motion, read_motion
+from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, Motion, builtin_motion, read_motion
 from snarfcli.motions.layouts import HANDS, SMPL, layout_of
 from snarfcli.motions.world import UPS
 from snarfcli.runs import choose_device, find_avatar, machine_facts, run_folder, set_threads
@@ -37,6 +40,8 @@ __all__ = ["AnimateConfig", "run"]
 
 log = logging.getLogger(__name__)
 
+_MOTION = "jumping_jacks"
+_BUILTIN_MOTIONS = (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES)
 _RECORD = "animation.json"
 _VIDEO = "video.mp4"
 _RESOLUTIONS = (16, 1024)  # dense lattices: 1024 take some 4 GB for a body with its arms spread
@@ -52,6 +57,8 @@ class AnimateConfig:
     """Whose avatar, such as 50002."""
     data: DataConfig = MISSING
     """Which data the avatar was trained on."""
+    data_root: str = MISSING
+    """Folder with the processed samples, whose motions are for skeletons that the built-in ones do not fit."""
     output_root: str = MISSING
     """Folder with the runs; the avatar is <output_root>/<data>/<subject>/<run>/avatar.pt."""
     run: str = MISSING
@@ -68,8 +75,9 @@ class AnimateConfig:
     """For .bvh and .glb: JSON file {joint of the avatar: joint of the pose file}; null goes by the usual names."""
     clip: str | None = MISSING
     """For .bvh and .glb: name or number of the animation; null for the first."""
-    motion: str = MISSING
-    """Built-in motion, such as jumping_jacks, if there is no pose file."""
+    motion: str | None = MISSING
+    """Without a pose file: a built-in motion of SMPL's joints, or a sequence of the samples of any other skeleton; null for
+    jumping_jacks, or for the held-out sequence."""
     motion_seed: int = MISSING
     """Variant of the built-in motion."""
     motion_frame_rate: float = MISSING
@@ -130,8 +138,9 @@ def run(config: AnimateConfig) -> int:
     device = choose_device(config.device)
     set_threads(config.threads)
     avatar = Avatar.load(path, device)
-    whole = _read(config, avatar.skeleton)
+    whole, transforms = _read(config, avatar.skeleton)
     motion, numbers = _selected(config, whole)
+    transforms = None if transforms is None else transforms[numbers]
     folder = Path(config.output) if config.output else path.parent / "animation" / _file_name(motion.name)
     settings = _settings(config, path, whole, numbers)
     _prepare(folder, settings, config.overwrite)
@@ -153,6 +162,7 @@ def run(config: AnimateConfig) -> int:
         weights_from=canonical,
         weight_colors=config.weight_colors,
         keep_share=config.keep_share,
+        bone_transforms=transforms,
     )
     try:
         if config.video:
@@ -164,6 +174,7 @@ def run(config: AnimateConfig) -> int:
                 aspect=size[0] / size[1],
                 azimuth_rad=math.radians(config.azimuth_deg),
                 elevation_rad=math.radians(config.elevation_deg),
+                bone_transforms=transforms,
             )
             write_video(folder / _VIDEO, animation.pictures(stage, size), motion.frame_rate)
         else:
@@ -200,19 +211,23 @@ def _check(config: AnimateConfig) -> tuple[int, int]:
     return numbers
 
 
-def _read(config: AnimateConfig, skeleton: Skeleton) -> Motion:
-    """Return the whole motion, with y up."""
+def _read(config: AnimateConfig, skeleton: Skeleton) -> tuple[Motion, NDArray[np.float32] | None]:
+    """Return the whole motion, with y up, and its bone transforms where the poses do not say it all."""
     if config.pose is not None:
-        return read_motion(
+        motion = read_motion(
             config.pose, skeleton, up=config.up, hands=config.hands, mapping=config.mapping, clip=config.clip
         )
-    motion = builtin_motion(config.motion, config.motion_seed, frame_rate=config.motion_frame_rate)
-    if layout_of(skeleton) != SMPL:
+        return motion, None
+    is_smpl = layout_of(skeleton) == SMPL
+    if not is_smpl and config.data.name != "builtin" and config.motion not in _BUILTIN_MOTIONS:
+        return stored_motion(config.data_root, config.data.name, config.subject, config.motion, skeleton)
+    motion = builtin_motion(config.motion or _MOTION, config.motion_seed, frame_rate=config.motion_frame_rate)
+    if not is_smpl:
         raise UserError(
             f"motion {motion.name} is for SMPL's 24 joints, the avatar has {skeleton.num_joints} of another kind;"
             " give a motion of its own by --pose FILE, such as .bvh, .glb or .npz"
         )
-    return motion
+    return motion, None
 
 
 def _selected(config: AnimateConfig, motion: Motion) -> tuple[Motion, list[int]]:

@@ -126,7 +126,8 @@ def draw_frame(
     floor_y = float(truth.vertices[:, 1].min())
     pose, translation = (torch.as_tensor(values[index]) for values in (sequence.poses, sequence.translation))
     try:
-        predicted = field_surface(avatar, pose, translation, resolution)
+        transforms = torch.as_tensor(sequence.bone_transforms[index])
+        predicted = field_surface(avatar, pose, translation, resolution, transforms=transforms)
     except ValueError as error:
         log.warning("warning: nothing to draw for %s, frame %d: %s", sequence.name, sequence.frame_numbers[index], error)
         predicted = None

@@ -68,6 +68,8 @@ class Animation:
     """Canonical mesh whose weights colour the meshes of the field, see `field_surface`."""
     weight_colors: bool = False
     """Whether vertices are coloured by their skinning weights."""
+    bone_transforms: np.ndarray | None = None
+    """[T, J, 4, 4] canonical to posed, metres, where the poses do not say it all; None: those of the poses."""
     keep_share: float = 0.01
     """Connected surfaces with fewer faces than this share of the largest one's are dropped."""
     frames: list[FrameRecord] = field(default_factory=list)
@@ -113,6 +115,7 @@ class Animation:
                 surface=self.surface,
                 weights_from=self.weights_from if self.weight_colors else None,
                 keep_share=self.keep_share,
+                transforms=None if self.bone_transforms is None else torch.from_numpy(self.bone_transforms[index]),
             )
         except (EmptySurface, FullSurface) as error:
             frame.problem, frame.file = str(error), None

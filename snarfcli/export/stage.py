@@ -39,6 +39,7 @@ def set_stage(
     aspect: float = 1.0,
     azimuth_rad: float = math.radians(28),
     elevation_rad: float = math.radians(9),
+    bone_transforms: np.ndarray | None = None,
 ) -> Stage:
     """Find a camera that sees the body in all frames, from the side that it mostly faces, and the floor below it.
 
@@ -50,6 +51,7 @@ def set_stage(
         aspect: width over height of the picture.
         azimuth_rad: direction of the camera seen from the body: 0 is straight ahead of it, a quarter turn its left.
         elevation_rad: how far the camera looks down.
+        bone_transforms: [T, J, 4, 4] canonical to posed, metres, instead of those of the poses.
     """
     points_c = None
     if canonical_mesh is not None:
@@ -57,8 +59,11 @@ def set_stage(
         some = np.linspace(0, len(canonical_mesh.vertices) - 1, min(count, len(canonical_mesh.vertices)))
         points_c = torch.from_numpy(canonical_mesh.vertices[some.astype(int)])
     points = []
-    for pose, shift in zip(torch.from_numpy(poses).float(), torch.from_numpy(translation).float(), strict=True):
-        transforms = avatar.bone_transforms(pose[None], shift[None])[0]
+    for frame, (pose, shift) in enumerate(zip(torch.from_numpy(poses), torch.from_numpy(translation), strict=True)):
+        if bone_transforms is None:
+            transforms = avatar.bone_transforms(pose[None].float(), shift[None].float())[0]
+        else:
+            transforms = torch.from_numpy(bone_transforms[frame])
         if points_c is not None:
             points.append(avatar.skin(points_c, transforms).cpu().numpy())
         else:

@@ -53,6 +53,7 @@ def field_surface(
     weights_from: Mesh | None = None,
     keep_share: float = 0.01,
     chunk: int = 65536,
+    transforms: Tensor | None = None,
 ) -> Mesh:
     """Extract the surface of the posed occupancy: the union over all correspondences, watertight (S Eq. 9).
 
@@ -65,11 +66,12 @@ def field_surface(
             vertex of this mesh in the same pose that faces the same way.
         keep_share: see `extract_surface`.
         chunk: points in one query.
+        transforms: [J, 4, 4] canonical to posed, metres, instead of those of the pose; for joints that stretch.
 
     Raises:
         EmptySurface, FullSurface: the field has no surface.
     """
-    pose, transforms = _posed(avatar, pose, translation)
+    pose, transforms = _posed(avatar, pose, translation, transforms)
     lower, upper = avatar.posed_box(transforms)
 
     def posed_logits(points: Tensor) -> Tensor:
@@ -114,6 +116,7 @@ def skinned_surface(
     *,
     keep_share: float = 0.01,
     chunk: int = 65536,
+    transforms: Tensor | None = None,
 ) -> Mesh:
     """Extract the canonical surface under the condition of `pose` and move it by linear blend skinning.
 
@@ -121,7 +124,7 @@ def skinned_surface(
 
     Args and raises: as `field_surface`; `resolution` counts along the longest side of the canonical box.
     """
-    pose, transforms = _posed(avatar, pose, translation)
+    pose, transforms = _posed(avatar, pose, translation, transforms)
     mesh_c = canonical_surface(avatar, pose, resolution, keep_share=keep_share, chunk=chunk)
     return replace(mesh_c, vertices=_skin(avatar, transforms, mesh_c.vertices), normals=None).with_normals()
 
@@ -135,6 +138,7 @@ def posed_mesh(
     surface: str = "field",
     weights_from: Mesh | None = None,
     keep_share: float = 0.01,
+    transforms: Tensor | None = None,
 ) -> Mesh:
     """Return the surface of the kind `surface`, see `SURFACES`; `weights_from` serves `field` only.
 
@@ -143,19 +147,27 @@ def posed_mesh(
         EmptySurface, FullSurface: the field has no surface.
     """
     if surface == "field":
-        return field_surface(avatar, pose, translation, resolution, weights_from=weights_from, keep_share=keep_share)
+        return field_surface(
+            avatar, pose, translation, resolution, weights_from=weights_from, keep_share=keep_share, transforms=transforms
+        )
     if surface == "skinned":
-        return skinned_surface(avatar, pose, translation, resolution, keep_share=keep_share)
+        return skinned_surface(avatar, pose, translation, resolution, keep_share=keep_share, transforms=transforms)
     raise ValueError(f"surface: wanted one of {', '.join(SURFACES)}, got {surface!r}")
 
 
-def _posed(avatar: AvatarLike, pose: Tensor, translation: Tensor | None) -> tuple[Tensor, Tensor]:
+def _posed(
+    avatar: AvatarLike, pose: Tensor, translation: Tensor | None, transforms: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Check the arguments; return the pose as float32 and the bone transforms [J, 4, 4]."""
     if pose.ndim != 2 or pose.shape[1] != 3:
         raise ValueError(f"pose: wanted shape [J, 3], got {list(pose.shape)}")
     if translation is not None and translation.shape != (3,):
         raise ValueError(f"translation: wanted shape [3], got {list(translation.shape)}")
     pose = pose.float()
+    if transforms is not None:
+        if transforms.shape != (len(pose), 4, 4):
+            raise ValueError(f"transforms: wanted shape [{len(pose)}, 4, 4], got {list(transforms.shape)}")
+        return pose, transforms.float()
     translation = None if translation is None else translation.float()[None]
     return pose, avatar.bone_transforms(pose[None], translation)[0]
 

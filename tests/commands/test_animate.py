@@ -19,6 +19,7 @@ from snarfcli.commands.animate import AnimateConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.meshing.extract import EmptySurface
+from snarfcli.motions import Motion
 
 VOLUME = np.pi * RADIUS**2 * 2 * LENGTH + 4 / 3 * np.pi * RADIUS**3
 
@@ -57,6 +58,7 @@ def config(tmp_path: Path, pose_file: Path, toy: ToyAvatar) -> AnimateConfig:
         hands="rest",
         mapping=None,
         clip=None,
+        data_root=str(tmp_path / "data"),
         motion="jumping_jacks",
         motion_seed=0,
         motion_frame_rate=30.0,
@@ -291,3 +293,24 @@ def test_the_command_line(config, pose_file, capsys):
     assert len(video_frames(folder_of(config) / "video.mp4")[1]) == 2
     assert main([*arguments, "resolution=32"]) == 2
     assert "give overwrite=true" in capsys.readouterr().err
+
+
+def test_another_skeleton_moves_as_its_samples_do(config, toy, tmp_path, monkeypatch):
+    """Joints that stretch follow the bone transforms of the samples."""
+    poses = np.zeros((2, 2, 3))
+    motion = Motion("wave", poses, np.zeros((2, 3)), 24.0)
+    transforms = np.tile(np.eye(4, dtype=np.float32), (2, 2, 1, 1))
+    transforms[1, :, 1, 3] = 0.7
+    asked = []
+
+    def stored(*arguments):
+        asked.append(arguments[1:4])
+        return motion, transforms
+
+    monkeypatch.setattr(animate, "stored_motion", stored)
+    other = replace(config, data=DataConfig("meshes", 1, 1, 1), pose=None, motion=None, ckpt=str(tmp_path / "avatar.pt"))
+    (tmp_path / "avatar.pt").write_bytes(b"the toy")
+    assert run(replace(other, output=str(tmp_path / "out"))) == 0
+    assert asked == [("meshes", "50002", None)]
+    low, high = (trimesh.load(tmp_path / "out" / f"frame_{index:06d}.ply").centroid[1] for index in range(2))
+    assert high - low == pytest.approx(0.7, abs=0.01)

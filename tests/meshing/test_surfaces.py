@@ -27,6 +27,17 @@ def test_straight_surfaces_agree_with_the_capsule():
         assert solid.is_watertight and solid.volume == pytest.approx(VOLUME, rel=0.01)
 
 
+def test_given_transforms_take_the_place_of_the_poses():
+    avatar = ToyAvatar()
+    transforms = avatar.bone_transforms(bent(0.9)[None], torch.tensor([[0.3, 0.0, 0.0]]))[0]
+    for surface in ("field", "skinned"):
+        given = posed_mesh(avatar, bent(0.0), resolution=32, surface=surface, transforms=transforms)
+        wanted = posed_mesh(avatar, bent(0.9), torch.tensor([0.3, 0.0, 0.0]), 32, surface=surface)
+        np.testing.assert_allclose(given.vertices, wanted.vertices, atol=1e-5)
+    with pytest.raises(ValueError, match=r"transforms: wanted shape \[2, 4, 4\], got \[3, 4, 4\]"):
+        posed_mesh(avatar, bent(0.0), transforms=torch.eye(4).expand(3, 4, 4))
+
+
 def test_field_and_skinned_surface_coincide_when_bent():
     avatar, shift = ToyAvatar(), torch.tensor([0.3, -2.0, 5.0])
     field = field_surface(avatar, bent(0.9), shift, 96)

@@ -15,11 +15,13 @@ from pathlib import Path
 from omegaconf import MISSING
 
 import snarfcli
+from snarfcli.datasets.settings import DataConfig
 
 __all__ = ["DoctorConfig", "Finding", "run"]
 
 log = logging.getLogger(__name__)
 
+_SUBJECTS_CHECKED = 3  # of a data set, which take some seconds each
 _LISTED = 8  # names of data or runs on one line; a long list helps nobody
 
 
@@ -31,6 +33,14 @@ class DoctorConfig:
     """Folder to look for data and processed samples in."""
     output_root: str = MISSING
     """Folder to look for trained avatars in."""
+    data: DataConfig | None = None
+    """A data set to check instead of the installation."""
+    subject: str | None = None
+    """Subject of it to check; null for the first few."""
+    body: str | None = None
+    """Body model, or a folder with it; null: looked for below data_root."""
+    figure: str | None = None
+    """Where the picture of the data goes; null: <output_root>/doctor/<data>_<subject>.png."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +57,10 @@ def run(config: DoctorConfig) -> int:
     """Print what is there. A broken part is reported like any other: the other parts are still looked at.
 
     Returns:
-        0, also where fallbacks are in use.
+        0, also where fallbacks are in use; 2 if a data set was to be checked and cannot be used.
     """
+    if config.data is not None:
+        return _check_data(config, config.data)
     sections: dict[str, Callable[[], Iterator[Finding]]] = {
         "versions": _versions,
         "processor": _processor,
@@ -66,6 +78,41 @@ def run(config: DoctorConfig) -> int:
     log.info("")
     log.info("%s", f"fallbacks or missing parts: {', '.join(fallbacks)} (see above)" if fallbacks else "nothing is missing")
     return 0
+
+
+def _check_data(config: DoctorConfig, data: DataConfig) -> int:
+    """Say whether a data set can be used, and what to mend; draw each subject that is looked at."""
+    from snarfcli.datasets.checking import check_subject
+    from snarfcli.datasets.sources import Request, find_source
+
+    request = Request(data, Path(config.data_root), config.body)
+    subjects = [config.subject] if config.subject not in (None, "all") else list(find_source(data.name).subjects(request))
+    chosen = subjects if config.subject is not None else subjects[:_SUBJECTS_CHECKED]
+    log.info("data set %s, subjects: %s", data.name, _listed(subjects))
+    unusable: list[str] = []
+    for subject in chosen:
+        figure = Path(config.output_root) / "doctor" / f"{data.name}_{subject}.png"
+        if config.figure is not None:
+            figure = Path(config.figure)
+            figure = figure if len(chosen) == 1 else figure.with_stem(f"{figure.stem}_{subject}")
+        log.info("subject %s", subject)
+        for remark in check_subject(subject, request, figure):
+            mark = {"fact": "", "warning": "warning: ", "problem": "PROBLEM: "}[remark.kind]
+            log.info("  %-16s%s%s", remark.name, mark, remark.text)
+            if remark.kind == "problem" and subject not in unusable:
+                unusable.append(subject)
+    log.info("")
+    if len(chosen) < len(subjects):
+        log.info("%d subjects more; give subject=NAME or subject=all", len(subjects) - len(chosen))
+    if unusable:
+        log.info("not usable as it is: %s (see PROBLEM above)", _listed(unusable))
+    else:
+        log.info('usable; next: "snarf preprocess data=%s subject=%s%s"', data.name, chosen[0], _folder_setting(data))
+    return 2 if unusable else 0
+
+
+def _folder_setting(data: DataConfig) -> str:
+    return f" data.folder={data.folder}" if data.folder is not None else ""
 
 
 def _survey(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:

@@ -17,7 +17,7 @@ help:
 	@echo "make fuzz      feed every reader of foreign files with 20,000 broken ones"
 	@echo "make sanitize  run the deformer's tests on a library built with address and undefined-behaviour checks (Linux)"
 	@echo "make lint      check the style of the code"
-	@echo "make bench     measure the searches, a training step, evaluation and mesh extraction"
+	@echo "make bench     measure the searches, preprocessing, batches, a training step, evaluation and mesh extraction"
 	@echo "make clean     remove .venv, builds, samples and results"
 
 setup: $(INSTALLED)
@@ -48,6 +48,7 @@ lint: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_search.py
+	$(VENV)/bin/python benchmarks/bm_data.py
 	$(VENV)/bin/python benchmarks/bm_training.py
 	$(VENV)/bin/python benchmarks/bm_evaluation.py
 	$(VENV)/bin/python benchmarks/bm_extraction.py

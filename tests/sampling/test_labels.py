@@ -26,12 +26,12 @@ _ON_THE_SURFACE_M = 1e-5
 @pytest.fixture(scope="module")
 def posed():
     """The body while it hops, and in a deep squat, where it goes through itself."""
-    body = builtin_body()
-    hops, squats = builtin_motion("light_hopping_loose", 50002), builtin_motion("deep_squats", 50002)
-    first, last = (
-        BodyMeshes(body, np.zeros(10), motion.poses, motion.translation)[frame] for motion, frame in ((hops, 100), (squats, 240))
-    )
-    return {"hops": first, "squats": last}
+    chosen = {"hops": ("light_hopping_loose", 100), "squats": ("deep_squats", 240)}
+    body, meshes = builtin_body(), {}
+    for pose, (name, frame) in chosen.items():
+        motion = builtin_motion(name, 50002)
+        meshes[pose] = BodyMeshes(body, np.zeros(10), motion.poses, motion.translation)[frame]
+    return meshes
 
 
 def exact_winding(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ A subject's folder `{root}/processed/{data}/{subject}` holds
     {train,test,ood}/{sequence}/
         points.npy       [T, P, 3]     uint16, quantised in the frame's sampling cube
         occupancies.npy  [T, P / 8]    uint8, one bit a point, most significant first
-        vertices.npy     [sum V, 3]    uint16, the posed meshes' vertices, quantised likewise, one frame after the other
+        vertices.npy     [sum V]       uint64, the posed meshes' vertices, 21 bits an axis, one frame after the other
         faces.npy        [sum F, 3]    int32, the faces of each topology that occurs
         frames.npz                     poses, bone transforms, joints, cubes, boxes, where each mesh starts
         sequence.json                  settings, counts, checksums; a sequence without it does not exist
@@ -18,6 +18,7 @@ from __future__ import annotations
 import hashlib
 import zipfile
 import zlib
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ import numpy as np
 
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
-from snarfcli.sampling.points import dequantise
+from snarfcli.sampling.points import dequantise, unpack_vertices
 
 if TYPE_CHECKING:
     from snarfcli.bodies.skeleton import Skeleton
@@ -94,8 +95,6 @@ class SequenceSamples:
         arrays = _read_arrays(folder / "frames.npz")
         self._vertex_start, self._face_start = arrays["vertex_start"], arrays["face_start"]
         self._topology = arrays["topology"]
-        self._vertices = _open_array(folder / "vertices.npy", (int(self._vertex_start[-1]), 3), np.uint16)
-        self._faces = _open_array(folder / "faces.npy", (int(self._face_start[-1]), 3), np.int32)
         self.poses: np.ndarray = arrays["poses"]
         """[T, J, 3] float32 axis-angle, radians, global orientation included."""
         self.translation: np.ndarray = arrays["translation"]
@@ -110,6 +109,15 @@ class SequenceSamples:
         """Frames of the motion a second; the samples may leave some out."""
         self._cube_lower, self._cube_size = arrays["cube_lower"], arrays["cube_size"]
         self._box_lower, self._box_upper = arrays["box_lower"], arrays["box_upper"]
+
+    # Opened when they are asked for: every open array takes one of the files that a process may have open.
+    @cached_property
+    def _vertices(self) -> np.ndarray:
+        return _open_array(self.folder / "vertices.npy", (int(self._vertex_start[-1]),), np.uint64)
+
+    @cached_property
+    def _faces(self) -> np.ndarray:
+        return _open_array(self.folder / "faces.npy", (int(self._face_start[-1]), 3), np.int32)
 
     @property
     def num_uniform(self) -> int:
@@ -154,9 +162,9 @@ class SequenceSamples:
         return ((self._packed[rows, index >> 3] >> (7 - (index & 7)).astype(np.uint8)) & 1).view(bool)
 
     def vertices(self, frame: int) -> np.ndarray:
-        """Return the posed mesh of one frame: [V, 3] float32, metres, right to half a step of the quantisation (0.02 mm)."""
+        """Return the posed mesh of one frame: [V, 3] float32, metres, right to a micrometre."""
         cells = self._vertices[self._vertex_start[frame] : self._vertex_start[frame + 1]]
-        return dequantise(cells, self._cube_lower[frame], self._cube_size[frame])
+        return unpack_vertices(cells, self._cube_lower[frame], self._cube_size[frame])
 
     def faces(self, frame: int) -> np.ndarray:
         """Return the faces of one frame's mesh: [F, 3] int32, outward."""

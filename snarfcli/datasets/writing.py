@@ -69,7 +69,7 @@ class SequenceWriter:
         self._inside = self._differing = self._boundary_edges = 0
         self._topologies: list[np.ndarray] = []
         self._topology = np.zeros(num_frames, np.int64)
-        self._spooled = np.zeros((num_frames, 2), np.int64)  # of each frame's vertices: first one and number in the spool
+        self._spooled = np.zeros((num_frames, 2), np.int64)  # of each frame's vertices: their place in the spool, and how many
         self._points = self._occupancies = self._spool = None
         try:
             self._points, self._points_start = _start_array(self._partial / "points.npy", (*self._shape, 3), "<u2")
@@ -89,8 +89,8 @@ class SequenceWriter:
         self._occupancies.seek(self._bits_start + frame * (num_points // 8))
         self._occupancies.write(np.packbits(samples.occupied).data)
         # how many vertices the frames before this one have is not known yet, so they are put in order by `finish`
-        self._spooled[frame] = self._spool.tell() // 6, len(samples.vertices)
-        self._spool.write(np.ascontiguousarray(samples.vertices, "<u2").data)
+        self._spooled[frame] = self._spool.tell(), len(samples.vertices)
+        self._spool.write(np.ascontiguousarray(samples.vertices, "<u8").data)
         self._topology[frame] = self._topology_of(samples.faces)
         self._cubes[frame, :3], self._cubes[frame, 3] = samples.cube_lower, samples.cube_size
         self._boxes[frame] = samples.box_lower, samples.box_upper
@@ -149,11 +149,11 @@ class SequenceWriter:
     def _write_vertices(self) -> np.ndarray:
         """Write the spooled vertices in the order of the frames; return where each frame's start, [T + 1]."""
         starts = np.concatenate([[0], np.cumsum(self._spooled[:, 1])])
-        file, _ = _start_array(self._partial / "vertices.npy", (int(starts[-1]), 3), "<u2")
+        file, _ = _start_array(self._partial / "vertices.npy", (int(starts[-1]),), "<u8")
         with file:
-            for first, count in self._spooled:
-                self._spool.seek(int(first) * 6)
-                file.write(self._spool.read(int(count) * 6))
+            for place, count in self._spooled:
+                self._spool.seek(int(place))
+                file.write(self._spool.read(int(count) * 8))
         self._spool.close()
         (self._partial / _SPOOL).unlink()
         return starts

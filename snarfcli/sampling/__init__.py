@@ -17,12 +17,14 @@ from snarfcli.sampling.points import (
     SamplingSettings,
     dequantise,
     frame_generator,
+    pack_vertices,
     quantise,
     sample_frame,
     sample_frames,
     sampling_cube,
     surface_samples,
     uniform_surface_samples,
+    unpack_vertices,
 )
 
 __all__ = [
@@ -40,6 +42,7 @@ __all__ = [
     "interrupts_held_back",
     "labels_differ",
     "occupancies",
+    "pack_vertices",
     "quantise",
     "ray_parity",
     "run_in_processes",
@@ -47,6 +50,7 @@ __all__ = [
     "sample_frames",
     "sampling_cube",
     "surface_samples",
+    "unpack_vertices",
     "uniform_surface_samples",
     "winding_numbers",
 ]

@@ -19,18 +19,22 @@ __all__ = [
     "SamplingSettings",
     "dequantise",
     "frame_generator",
+    "pack_vertices",
     "quantise",
     "sample_frame",
     "sample_frames",
     "sampling_cube",
     "surface_samples",
     "uniform_surface_samples",
+    "unpack_vertices",
 ]
 
 CUBE_PADDING = 0.1
 """The papers' box is a cube around the mesh whose side is the longest side of the tight box times 1.1."""
 
 _LEVELS = 65536  # uint16; in a cube of 2 m the steps are 30 micrometres
+_VERTEX_BITS = 21  # three of them fit a uint64
+_VERTEX_LEVELS = 1 << _VERTEX_BITS
 # MeshLab draws this many candidates for each sample and keeps those that are a disk apart. Its defaults (20, and the best
 # of 10 in each cell) take 5 times as long; the spacing varies by 7 % then and by 10 % so, below noise as wide as the spacing.
 _POISSON_OPTIONS = {"montecarlorate": 6, "bestsampleflag": False}
@@ -75,7 +79,7 @@ class FrameSamples:
     occupied: np.ndarray
     """[P] bool, labels of the quantised points."""
     vertices: np.ndarray
-    """[V, 3] uint16, the mesh's vertices quantised in the cube."""
+    """[V] uint64, the mesh's vertices in the cube, see `pack_vertices`."""
     faces: np.ndarray
     """[F, 3] int32."""
     cube_lower: np.ndarray
@@ -151,6 +155,24 @@ def dequantise(cells: np.ndarray, cube_lower: np.ndarray, cube_size: np.ndarray 
     """
     step = np.asarray(cube_size, np.float32) / np.float32(_LEVELS)
     return (cells.astype(np.float32) + np.float32(0.5)) * step + np.asarray(cube_lower, np.float32)
+
+
+def pack_vertices(vertices: np.ndarray, cube_lower: np.ndarray, cube_size: float) -> np.ndarray:
+    """Return vertices [V, 3], metres, as one uint64 each [V]: 21 bits an axis, in a cube of 2 m right to half a micrometre.
+
+    The mesh stays finer than the 16 bits of the points, for which no label would be wrong beyond 0.01 mm from the surface.
+    """
+    cells = np.floor((np.asarray(vertices, np.float64) - cube_lower) * (_VERTEX_LEVELS / np.float64(cube_size)))
+    x, y, z = np.clip(cells, 0, _VERTEX_LEVELS - 1).astype(np.uint64).T
+    return x | y << np.uint64(_VERTEX_BITS) | z << np.uint64(2 * _VERTEX_BITS)
+
+
+def unpack_vertices(packed: np.ndarray, cube_lower: np.ndarray, cube_size: float) -> np.ndarray:
+    """Return the vertices [V, 3] float32, metres, that `pack_vertices` packed."""
+    shifts = np.array([0, _VERTEX_BITS, 2 * _VERTEX_BITS], np.uint64)
+    cells = (packed[:, None] >> shifts) & np.uint64(_VERTEX_LEVELS - 1)
+    step = np.float64(cube_size) / _VERTEX_LEVELS
+    return ((cells.astype(np.float64) + 0.5) * step + cube_lower).astype(np.float32)
 
 
 def surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -251,7 +273,7 @@ def sample_frame(
     return FrameSamples(
         points=cells,
         occupied=ray_parity(vertices, faces, points) if by_parity else winding > 0.5,
-        vertices=quantise(vertices, cube_lower, cube_size),
+        vertices=pack_vertices(vertices, cube_lower, cube_size),
         faces=faces.astype(np.int32),
         cube_lower=cube_lower,
         cube_size=cube_size,

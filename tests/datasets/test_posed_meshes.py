@@ -7,8 +7,10 @@ import sys
 
 import pytest
 
+_MODULES = ["cli", "datasets.cape_frames", "datasets.posed_meshes", "datasets.store", "formats.surfaces"]
 
-@pytest.mark.parametrize("module", ["snarfcli.cli", "snarfcli.datasets.posed_meshes", "snarfcli.datasets.store"])
+
+@pytest.mark.parametrize("module", [f"snarfcli.{name}" for name in _MODULES])
 def test_worker_processes_start_without_pytorch(module: str) -> None:
     """Importing it takes longer than sampling ten frames; every task of `snarf preprocess` starts a process."""
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"

@@ -20,7 +20,7 @@ from snarfcli.datasets.writing import (
     write_manifest,
 )
 from snarfcli.errors import UserError
-from snarfcli.sampling import FrameSamples, dequantise
+from snarfcli.sampling import FrameSamples, dequantise, unpack_vertices
 
 _POINTS = 48
 _SETTINGS = {"seed": 0, "points_per_frame": _POINTS}
@@ -34,7 +34,7 @@ def _frame(seed: int) -> FrameSamples:
     return FrameSamples(
         points=cells,
         occupied=generator.random(_POINTS) < 0.3,
-        vertices=generator.integers(0, 65536, (corners, 3)).astype(np.uint16),
+        vertices=generator.integers(0, 2**63, corners).astype(np.uint64),
         faces=np.arange(3 * corners, dtype=np.int32).reshape(-1, 3) % corners,
         cube_lower=lower,
         cube_size=np.float32(1 + seed),
@@ -125,7 +125,7 @@ def test_the_rest_comes_back(folder: Path) -> None:
     np.testing.assert_array_equal(walk.joints, arrays["joints"])
     for frame in (0, 1, 4, 5, 19):
         made = _frame(frame)
-        wanted = dequantise(made.vertices, made.cube_lower, made.cube_size)
+        wanted = unpack_vertices(made.vertices, made.cube_lower, made.cube_size)
         np.testing.assert_array_equal(walk.vertices(frame), wanted)
         np.testing.assert_array_equal(walk.faces(frame), made.faces)
         np.testing.assert_array_equal(walk.box(frame), (made.box_lower, made.box_upper))

@@ -1,0 +1,58 @@
+"""The registered meshes of CAPE, one file a frame. Worker processes import this file, so it does without PyTorch."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snarfcli.errors import UserError
+from snarfcli.files import read_npz
+
+__all__ = ["CapeMeshes", "read_cape_frame"]
+
+_FRAME_SHAPES = {"v_posed": (None, 3), "pose": (72,), "transl": (3,)}
+
+
+@dataclass(frozen=True, eq=False)
+class CapeMeshes:
+    """The registered meshes of one sequence, at the origin: without the recording's translation."""
+
+    paths: Sequence[Path]
+    """T files."""
+    faces: NDArray[np.int32]
+    """[F, 3] SMPL's."""
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> tuple[NDArray, NDArray]:
+        frame = read_cape_frame(self.paths[index], int(self.faces.max()) + 1)
+        return frame["v_posed"] - frame["transl"], self.faces
+
+    def chosen(self, frames: NDArray[np.int64]) -> CapeMeshes:
+        return CapeMeshes([self.paths[frame] for frame in frames], self.faces)
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256("\n".join(path.name for path in self.paths).encode()).hexdigest()[:16]
+
+
+def read_cape_frame(path: Path, num_vertices: int) -> dict[str, NDArray[np.float64]]:
+    """Return `v_posed` [V, 3] and `transl` [3], metres, and `pose` [72], radians, of one frame's file.
+
+    Raises:
+        UserError: the file cannot be read, lacks an array, or one does not fit.
+    """
+    arrays = read_npz(path, "CAPE frame")
+    for name, wanted in _FRAME_SHAPES.items():
+        shape = tuple(num_vertices if size is None else size for size in wanted)
+        if name not in arrays:
+            raise UserError(f"CAPE frame {path} has no '{name}'; it holds {', '.join(sorted(arrays)) or 'nothing'}")
+        array = arrays[name]
+        if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
+            raise UserError(f"CAPE frame {path}: {name} must be finite numbers of shape {list(shape)}, got {list(array.shape)}")
+    return {name: arrays[name].astype(np.float64) for name in _FRAME_SHAPES}

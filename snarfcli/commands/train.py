@@ -21,6 +21,7 @@ from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
 from snarfcli.models.avatar import Avatar, load_checkpoint
 from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
+from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.precision import PRECISIONS
@@ -169,13 +170,14 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
     """Return a fresh avatar of the store's subject in the hands of a trainer."""
     search = with_start_bones(config.search, store.skeleton)
     surface = rough_canonical_surface(store)
-    grid = CanonicalGrid.around(surface, config.skinning.margin_m)
+    skinning = with_grid_sides(config.skinning, surface, store.skeleton)
+    grid = CanonicalGrid.around(surface, skinning.margin_m)
     field = None
-    if config.skinning.name == "preset":
-        shape = tuple(config.skinning.resolution[::-1])
-        field = read_preset_weights(config.skinning.weights_file, grid, shape, store.skeleton.num_joints)
+    if skinning.name == "preset":
+        shape = tuple(skinning.resolution[::-1])
+        field = read_preset_weights(skinning.weights_file, grid, shape, store.skeleton.num_joints)
     avatar = Avatar(
-        AvatarConfig(config.model, config.skinning, search, config.shape),
+        AvatarConfig(config.model, skinning, search, config.shape),
         store.skeleton,
         grid,
         surface,

@@ -32,7 +32,7 @@ class SkinningConfig:
     softmax: str = "plain"
     """From logits to weights: plain, or hierarchical down the tree of joints; of no effect on preset weights."""
     resolution: list[int] = field(default_factory=lambda: [64, 64, 16])
-    """Grid nodes along x, y, z."""
+    """Grid nodes along x, y, z; a skeleton that is not SMPL's has as many in all, shared out by the sides of its box."""
     margin_m: list[float] = field(default_factory=lambda: [0.12, 0.12, 0.20])
     """What the grid's box adds around the canonical body on either side, along x, y, z, metres."""
     bone_radius_m: float | None = 0.22

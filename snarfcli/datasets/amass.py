@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,10 @@ from snarfcli.motions import read_motion, read_shape
 __all__ = ["Person", "amass_sequences", "find_sequences", "find_subjects", "papers_split", "read_person", "walk_files"]
 
 _DEPTH = 7  # archives unpack to at most three folders, which people put into folders of their own
-_OURS = {"processed", "outputs"}
+_LEFT_OUT = {
+    "processed", "outputs",  # ours
+    "mosh", "mpi_mosh", "mpimosh",  # in AMASS too, with people and exercises of DFaust's names: 50002/jumping_jacks_poses.npz
+}  # fmt: skip
 _KINDS = ("_poses", "_stageii")
 """How files of the older (SMPL-H) and of the newer release (SMPL-X) end; the papers used the older."""
 
@@ -37,7 +40,8 @@ def walk_files(root: Path, suffix: str = ".npz") -> Iterator[Path]:
     """Yield the files with a suffix at or below a folder, in a fixed order; links are followed, up to seven folders deep."""
     for folder, names, files in os.walk(root, followlinks=True):
         depth = len(Path(folder).relative_to(root).parts)
-        names[:] = sorted(name for name in names if name not in _OURS and not name.startswith(".")) if depth < _DEPTH else []
+        wanted = (name for name in names if name.lower() not in _LEFT_OUT and not name.startswith("."))
+        names[:] = sorted(wanted) if depth < _DEPTH else []
         for file in sorted(files):
             if file.lower().endswith(suffix):
                 yield Path(folder) / file
@@ -46,16 +50,18 @@ def walk_files(root: Path, suffix: str = ".npz") -> Iterator[Path]:
 def find_sequences(root: Path, subject: str, names: Iterable[str]) -> dict[str, Path]:
     """Return the AMASS files of a subject's sequences that are somewhere below a folder, by name.
 
-    A file counts as the subject's if its name starts with the subject's, or if it lies in a folder of the subject's name:
-    `DFaust_67/50002/50002_hips_poses.npz`, `DFaust/50002/50002_hips_stageii.npz`, `MPI_Limits/03099/op2_poses.npz`.
+    A file counts as the subject's if its name starts with the subject's (`DFaust_67/50002/50002_hips_poses.npz`,
+    `DFaust/50002/50002_hips_stageii.npz`) or, where there are none of these, if it lies in a folder of the subject's name
+    (`MPI_Limits/03099/op2_poses.npz`): other archives have folders of the same name.
     Of several files of one sequence the older release (SMPL-H) comes first, then the one in fewer folders.
     """
     wanted = "|".join(map(re.escape, names))
     pattern = re.compile(rf"({re.escape(subject)}_)?({wanted})({'|'.join(_KINDS)})\.npz", re.IGNORECASE)
+    matches = [(match, path) for path in walk_files(root) if (match := pattern.fullmatch(path.name))]
+    is_named = any(match[1] for match, _ in matches)
     found: dict[str, list[tuple[int, int, str, Path]]] = {}
-    for path in walk_files(root):
-        match = pattern.fullmatch(path.name)
-        if match and (match[1] or path.parent.name == subject):
+    for match, path in matches:
+        if match[1] or (not is_named and path.parent.name == subject):
             rank = (_KINDS.index(match[3].lower()), len(path.parts), str(path), path)
             found.setdefault(match[2].lower(), []).append(rank)
     return {name: min(ranks)[3] for name, ranks in found.items()}
@@ -63,8 +69,10 @@ def find_sequences(root: Path, subject: str, names: Iterable[str]) -> dict[str, 
 
 def find_subjects(root: Path, subjects: Iterable[str]) -> tuple[str, ...]:
     """Return which of some subjects have AMASS files below a folder."""
-    names = {path.name: path.parent.name for path in walk_files(root) if path.stem.lower().endswith(_KINDS)}
-    there = {name.split("_")[0] for name in names} | set(names.values())
+    there: set[str] = set()
+    for path in walk_files(root):
+        if path.stem.lower().endswith(_KINDS):
+            there |= {path.name.split("_")[0], path.parent.name}
     return tuple(subject for subject in subjects if subject in there)
 
 
@@ -84,17 +92,28 @@ def read_person(files: Mapping[str, Path], request: Request) -> Person:
     """Return the person of some sequences: shape and gender from `shape.npz` beside them or from a sequence, and the body.
 
     Raises:
-        UserError: there is no body model of this gender, or a file cannot be used.
+        UserError: there is no body model of this gender, `shape.npz` cannot be used, or, without one, none of the sequences.
     """
-    sequence = next(iter(files.values()))
     beside = [path.parent / "shape.npz" for path in files.values() if (path.parent / "shape.npz").is_file()]
-    shape = beside[0] if beside else sequence
-    gender, betas = read_shape(shape)
+    shape, gender, betas = _first_shape(beside[:1] or list(files.values()))
     path = find_body(request.body or request.data_root, "smpl", gender)
     body = load_body(path)
     betas = betas[: min(len(betas), _SMPL_BETAS, body.num_betas)]
-    sources = (f"body {path} ({gender})", f"shape {shape}", f"motions {sequence.parent}")
+    # SMPL-X has a shape space of its own
+    caution = " (meant for SMPL-X: on SMPL's body another build)" if shape.stem.lower().endswith("_stageii") else ""
+    sources = (f"body {path} ({gender})", f"shape {shape}{caution}", f"motions {next(iter(files.values())).parent}")
     return Person(body, betas, body.skeleton(betas), sources)
+
+
+def _first_shape(files: Sequence[Path]) -> tuple[Path, str, NDArray[np.float64]]:
+    """Return the first file that says whose body it is about, and gender and shape; a broken recording hides no other."""
+    problem = None
+    for file in files:
+        try:
+            return file, *read_shape(file)
+        except UserError as error:
+            problem = problem or error
+    raise problem or ValueError("files: wanted at least one")
 
 
 _SMPL_BETAS = 10  # the papers use the first ten

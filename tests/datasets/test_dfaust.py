@@ -91,6 +91,32 @@ def test_odd_files_are_read_alike(tmp_path: Path) -> None:
         assert other.frame_rate == first.frame_rate == 60.0
 
 
+def test_files_of_other_archives_are_not_taken(old: Path, tmp_path: Path) -> None:
+    write_dfaust(tmp_path, nested="archives/DFaust67")
+    write_body(tmp_path)
+    for folder in ("MPI_mosh", "renamed", "MPImosh/MPI_mosh"):  # MoSh's people and exercises have the same names
+        write_old(tmp_path / folder / "50002" / "jumping_jacks_poses.npz", amass_poses("knees"))
+    write_old(tmp_path / "MPI_mosh" / "50009" / "jumping_jacks_poses.npz", amass_poses("knees"))
+    assert_same(load(tmp_path), load(old), 0.0)
+    assert find_source("dfaust").subjects(Request(DataConfig("dfaust", 1, 1, 10), tmp_path)) == ("50002",)
+    (tmp_path / "archives/DFaust67/DFaust_67/50002/50002_jumping_jacks_poses.npz").unlink()
+    assert [name for name, _ in load(tmp_path).broken] == ["jumping_jacks"]
+
+
+def test_a_broken_recording_does_not_hide_the_person(tmp_path: Path) -> None:
+    write_dfaust(tmp_path, release="new")
+    write_body(tmp_path)
+    first = tmp_path / "DFaust" / "50002" / "50002_chicken_wings_stageii.npz"
+    first.write_bytes(first.read_bytes()[:500])
+    subject = load(tmp_path)
+    assert [name for name, _ in subject.broken] == ["chicken_wings"] and "meant for SMPL-X" in subject.sources[1]
+    np.testing.assert_array_equal(subject.betas, BETAS[:10])
+    for path in first.parent.iterdir():
+        path.write_bytes(b"")
+    with pytest.raises(UserError, match="50002_chicken_wings_stageii.npz"):
+        load(tmp_path)
+
+
 def test_poseprior_alone(old: Path) -> None:
     prior, dfaust = load(old, "poseprior"), load(old)
     assert prior.data == "poseprior" and {s.split for s in prior.sequences} == {"ood"}

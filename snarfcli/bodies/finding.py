@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,9 +32,11 @@ _NAMES = {
     "smplh": "SMPLH_{GENDER}.pkl, smplh/{gender}/model.npz",
     "smplx": "SMPLX_{GENDER}.npz, smplx/{gender}/model.npz",
 }
-# Deeper than any release unpacks. The bound on entries keeps a wrongly named place, such as /, from being searched for minutes.
+# Deeper than any release unpacks. The bounds keep a wrongly named place, such as /, from being searched for minutes; CAPE,
+# which lies beside the bodies, has some 150,000 files in some 600 folders.
 _MAX_DEPTH = 6
-_MAX_ENTRIES = 100_000
+_MAX_FOLDERS = 20_000
+_MAX_ENTRIES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -99,15 +102,16 @@ def find_body(place: str | Path, kind: str | None, gender: str) -> Path:
 def _search(place: Path) -> Iterator[_Found]:
     for path, depth in _files(place):
         name = path.name.lower()
-        folders = [part.lower() for part in Path(os.path.abspath(path)).parent.parts[::-1]]
         if match := _DOWNLOADED.fullmatch(name):
             version = tuple(int(part) for part in match["version"].split("."))
             gender = _LETTERS[match["gender"][0]]
             yield _Found("smpl", gender, version, bool(match["copy"]), path, depth)
         elif match := _RENAMED.fullmatch(name):
             yield _Found(match["kind"], match["gender"], (), bool(match["copy"]), path, depth)
-        elif _IN_FOLDER.fullmatch(name) and folders and folders[0] in GENDERS and (kind := _kind_of(folders[1:])):
-            yield _Found(kind, folders[0], (), False, path, depth)
+        elif _IN_FOLDER.fullmatch(name):
+            folders = [part.lower() for part in Path(os.path.abspath(path)).parent.parts[::-1]]
+            if folders and folders[0] in GENDERS and (kind := _kind_of(folders[1:])):
+                yield _Found(kind, folders[0], (), False, path, depth)
 
 
 def _kind_of(folders: list[str]) -> str | None:
@@ -123,24 +127,25 @@ def _kind_of(folders: list[str]) -> str | None:
 def _files(place: Path) -> Iterator[tuple[Path, int]]:
     """Yield the files in a folder and below, with their depth; links to folders are followed, but no folder is read twice."""
     seen: set[str] = set()
-    waiting = [(place, 0)]
+    waiting = deque([(place, 0)])
     entries = 0
     while waiting:
-        folder, depth = waiting.pop(0)
+        folder, depth = waiting.popleft()
         real = os.path.realpath(folder)
         if real in seen:
             continue
         seen.add(real)
         try:
-            content = sorted(folder.iterdir())
+            content = sorted(os.scandir(folder), key=lambda entry: entry.name)
         except OSError:  # not ours to read
             continue
-        for path in content:
-            entries += 1
-            if entries > _MAX_ENTRIES:
-                raise UserError(f"folder {place} holds over {_MAX_ENTRIES:,} files; name the folder with the body models")
-            if path.suffix.lower() in (".npz", ".pkl"):
-                if path.is_file():
-                    yield path, depth
-            elif depth < _MAX_DEPTH and path.is_dir():
-                waiting.append((path, depth + 1))
+        entries += len(content)
+        if entries > _MAX_ENTRIES or len(seen) > _MAX_FOLDERS:
+            much = f"over {_MAX_ENTRIES:,} files or {_MAX_FOLDERS:,} folders"
+            raise UserError(f"folder {place} holds {much}; name the folder with the body models by body=FOLDER")
+        for entry in content:
+            if entry.name.lower().endswith((".npz", ".pkl")):
+                if entry.is_file():
+                    yield folder / entry.name, depth
+            elif depth < _MAX_DEPTH and entry.is_dir():
+                waiting.append((folder / entry.name, depth + 1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -100,6 +101,16 @@ def test_very_deep_and_very_full_folders(tmp_path, monkeypatch):
     make(tmp_path, "/".join("abcdefgh") + "/SMPL_MALE.pkl")
     with pytest.raises(UserError, match="no male"):
         find_body(tmp_path, None, "male")
-    monkeypatch.setattr("snarfcli.bodies.finding._MAX_ENTRIES", 3)
-    with pytest.raises(UserError, match="name the folder with the body models"):
-        find_body(make(tmp_path / "full", *"12345"), None, "male")
+    full = make(tmp_path / "full", *"12345", "SMPL_MALE.pkl")
+    for bound in ("_MAX_ENTRIES", "_MAX_FOLDERS"):
+        with monkeypatch.context() as patched, pytest.raises(UserError, match="name the folder with the body models"):
+            patched.setattr(f"snarfcli.bodies.finding.{bound}", 0)
+            find_body(full, None, "male")
+
+
+def test_bodies_beside_cape_are_found(tmp_path, monkeypatch):
+    make(tmp_path, "smpl/SMPL_MALE.pkl", "cape_release/x")
+    many = [SimpleNamespace(name=f"{n}.npz", is_file=lambda: True, is_dir=lambda: False) for n in range(150_000)]
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda path: many if Path(path).name == "cape_release" else scandir(path))
+    assert find_body(tmp_path, "smpl", "male") == tmp_path / "smpl" / "SMPL_MALE.pkl"

@@ -26,6 +26,7 @@ MAX_ARRAY_BYTES = 2**30
 _BOMB_BYTES = 2**26
 _BOMB_RATIO = 500
 _LONGEST_HEADER = 2**16
+_MOST_JSON_BYTES = 2**25  # parsed they take some 600 MiB
 # The header is a Python dict of three entries; a type that is no word stands for records.
 _HEADER = (r"'descr':\s*'([^']*)'", r"'fortran_order':\s*(True|False)", r"'shape':\s*\(([\d\sL,]*)\)")
 
@@ -77,18 +78,18 @@ def read_json(path: str | Path, what: str = "file") -> Any:
     """Read a JSON file.
 
     Raises:
-        UserError: the file is missing or is not JSON.
+        UserError: the file is missing, is not JSON or is absurdly large.
     """
+    path = Path(path)
+    _check_regular(path, what, "a")
+    if path.stat().st_size > _MOST_JSON_BYTES:
+        raise UserError(f"{what} {path} has over {_MOST_JSON_BYTES // 2**20} MiB, too much for one; name another file")
     try:
-        return json.loads(Path(path).read_text())
-    except FileNotFoundError:
-        raise UserError(f"no {what} at {path}") from None
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise UserError(f"{what} {path} is not valid JSON ({error}); make it again") from None
+        return json.loads(path.read_text())
+    except ValueError as error:  # bad UTF-8, bad JSON, a number of over 4300 digits
+        raise UserError(f"{what} {path} is not valid JSON ({_one_line(str(error))}); make it again") from None
     except RecursionError:
         raise UserError(f"{what} {path} is not valid JSON (nested too deeply); make it again") from None
-    except IsADirectoryError:
-        raise UserError(f"{what} {path} is a folder; name a file") from None
 
 
 def read_npz(

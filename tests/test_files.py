@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from snarfcli.errors import UserError
-from snarfcli.files import atomic_path, read_npy, read_npz, write_json, write_tensors
+from snarfcli.files import atomic_path, read_json, read_npy, read_npz, write_json, write_tensors
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
@@ -26,6 +26,18 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
         write_json(path, {"a": float("nan")})
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == ["a.json"]
+
+
+@pytest.mark.parametrize("text", ["{", "[" * 100_000, "1" * 5000, "\xff", "", " " * (2**25 + 1)])
+def test_what_is_no_json_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "split.json"
+    path.write_bytes(text.encode("latin1"))
+    with pytest.raises(UserError, match="^split .*split.json ") as caught:
+        read_json(path, "split")
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+    for other, message in ((tmp_path, "is a folder"), (tmp_path / "none", "no split at")):
+        with pytest.raises(UserError, match=message):
+            read_json(other, "split")
 
 
 def test_a_full_disk_names_the_file(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from snarfcli.errors import UserError
 __all__ = [
     "INSIDE_TESTS",
     "check_mesh",
+    "check_vertices",
     "count_boundary_edges",
     "labels_differ",
     "occupancies",
@@ -19,6 +20,7 @@ __all__ = [
 INSIDE_TESTS = ("winding", "parity")
 """`winding`: the union of overlapping parts is inside. `parity`: where two parts overlap is outside again."""
 
+_FARTHEST_M = 1e6  # float32 tells points there 6 cm apart
 _INTEGER_TOLERANCE = 0.1  # on a closed body of 13,776 triangles the fast sum was never off by more than 0.005
 _RAY_DIRECTIONS = ((0.439, 0.618, 0.652), (-0.911, 0.130, -0.391), (0.199, -0.896, 0.397))  # any three, off the axes
 
@@ -46,14 +48,12 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, test: str = "winding", n
         name: what the mesh is called in messages.
 
     Raises:
-        UserError: the mesh is empty, has NaN or infinite vertices or faces that name no vertex, is turned inside out,
-            or is open and `test` is `parity`.
+        UserError: the mesh is empty, has vertices that are NaN, infinite or absurdly far away or faces that name no vertex, is
+            turned inside out, or is open and `test` is `parity`.
     """
     if len(vertices) == 0 or len(faces) == 0:
         raise UserError(f"{name} is empty ({len(vertices)} vertices, {len(faces)} faces); a closed surface was wanted")
-    if not np.isfinite(vertices).all():
-        bad = np.count_nonzero(~np.isfinite(vertices).all(axis=1))
-        raise UserError(f"{name} has {bad} vertices that are NaN or infinite; leave this frame out or repair its pose")
+    check_vertices(vertices, name)
     if faces.min() < 0 or faces.max() >= len(vertices):
         wrong = faces.min() if faces.min() < 0 else faces.max()
         raise UserError(f"{name} has {len(vertices)} vertices, but a face names vertex {wrong}; repair the mesh")
@@ -68,6 +68,20 @@ def check_mesh(vertices: np.ndarray, faces: np.ndarray, test: str = "winding", n
         if volume < 0:
             raise UserError(f"{name} is inside out (its volume is {volume:.3g} m^3); reverse the order of its faces")
     return boundary_edges
+
+
+def check_vertices(vertices: np.ndarray, name: str) -> None:
+    """Refuse vertices [V, 3], metres, of a mesh called `name` that are NaN, infinite or absurdly far away.
+
+    Raises:
+        UserError: some are.
+    """
+    if not np.isfinite(vertices).all():
+        bad = np.count_nonzero(~np.isfinite(vertices).all(axis=1))
+        raise UserError(f"{name} has {bad} vertices that are NaN or infinite; leave this frame out or repair its pose")
+    farthest = float(np.abs(vertices).max())
+    if farthest > _FARTHEST_M:
+        raise UserError(f"{name} has a vertex {farthest:.3g} m from the origin; repair it, or say what a unit is (data.scale)")
 
 
 def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -10,7 +10,14 @@ from typing import Protocol
 import numpy as np
 
 from snarfcli.errors import UserError, nearest
-from snarfcli.sampling.occupancy import INSIDE_TESTS, check_mesh, labels_differ, ray_parity, winding_numbers
+from snarfcli.sampling.occupancy import (
+    INSIDE_TESTS,
+    check_mesh,
+    check_vertices,
+    labels_differ,
+    ray_parity,
+    winding_numbers,
+)
 
 __all__ = [
     "CUBE_PADDING",
@@ -300,16 +307,21 @@ def sample_frames(
     """
     checked: np.ndarray | None = None
     for index, frame in enumerate(frames):
+        where = f"{names[-1]}, frame {frame}"
         try:
             vertices, faces = meshes[index]
             if checked is None or faces is not checked:
-                boundary_edges = check_mesh(vertices, faces, settings.inside_test, f"{names[-1]}, frame {frame}: the mesh")
+                boundary_edges = check_mesh(vertices, faces, settings.inside_test, f"{where}: the mesh")
                 checked = faces
-            elif not np.isfinite(vertices).all():
-                raise UserError(f"{names[-1]}, frame {frame}: the mesh has NaN or infinite vertices; repair its pose first")
-            generator = frame_generator(settings.seed, *names, int(frame))
-            samples = sample_frame(vertices, faces, settings, generator, boundary_edges=boundary_edges)
+            else:
+                check_vertices(vertices, f"{where}: the mesh")
         except UserError as error:
             yield BrokenFrame(str(error))
+            return
+        generator = frame_generator(settings.seed, *names, int(frame))
+        try:
+            samples = sample_frame(vertices, faces, settings, generator, boundary_edges=boundary_edges)
+        except UserError as error:
+            yield BrokenFrame(f"{where}: {error}")
             return
         yield samples

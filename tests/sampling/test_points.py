@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,14 @@ from toy_subject import capsule_mesh, crossing_capsules, mesh_volume
 
 from snarfcli.errors import UserError
 from snarfcli.sampling import (
+    BrokenFrame,
     SamplingSettings,
     dequantise,
     frame_generator,
     quantise,
     ray_parity,
     sample_frame,
+    sample_frames,
     sampling_cube,
     surface_samples,
     winding_numbers,
@@ -72,6 +75,25 @@ def test_missing_samples_are_drawn_from_the_faces(monkeypatch: pytest.MonkeyPatc
 def test_a_surface_without_area_is_refused() -> None:
     with pytest.raises(UserError, match="no area"):
         surface_samples(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"),
+    [
+        ([1, np.nan, 1], "walk, frame 7: the mesh has .* vertices that are NaN"),
+        ([1e200] * 3, r"walk, frame 7: the mesh has a vertex .*e\+199 m from the origin"),
+        ([1e8] * 3, r"walk, frame 7: the mesh has a vertex .* m from the origin"),
+        ([1, 0, 0], "walk, frame 7: mesh has no area"),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_a_frame_that_cannot_be_used_is_named(scale: list[float], message: str, first: bool) -> None:
+    vertices, faces = capsule_mesh(0.5, 0.1)
+    meshes = ([] if first else [(vertices, faces)]) + [(vertices * scale, faces), (vertices, faces)]
+    settings = replace(_SETTINGS, points_per_frame=80)
+    *good, broken = sample_frames(meshes, settings, ("fox", "walk"), [7, 8] if first else [5, 7, 8])
+    assert len(good) == (0 if first else 1)
+    assert isinstance(broken, BrokenFrame) and re.match(message, broken.message)
 
 
 def test_frame_has_both_kinds_of_points() -> None:

@@ -19,6 +19,7 @@ import torch
 
 from snarfcli.bodies import Body, find_body, load_body
 from snarfcli.datasets.cape_frames import CapeMeshes, read_cape_frame
+from snarfcli.datasets.recordings import folder_names
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import split_sequences
 from snarfcli.datasets.subjects import SequenceSpec, Split, SubjectData, body_template
@@ -43,7 +44,7 @@ def subjects(request: Request) -> tuple[str, ...]:
         UserError: there are none.
     """
     sequences = _release(request) / "sequences"
-    found = {f"{folder.parent.name}_{folder.name.split('_')[0]}" for folder in sequences.glob("*/*_*") if folder.is_dir()}
+    found = {f"{folder.parent.name}_{folder.name.split('_')[0]}" for folder in sequences.glob("*/*_?*") if folder.is_dir()}
     if not found:
         raise UserError(f"no CAPE sequences in {sequences}; wanted folders such as 00032/longshort_hips; see data/README.md")
     return tuple(sorted(found))
@@ -59,11 +60,8 @@ def load(subject: str, request: Request) -> SubjectData:
     person, outfit = _person_and_outfit(subject, subjects(request))
     body, sources = _minimal_body(person, release, request)
     skeleton = body.skeleton()
-    folders = {
-        folder.name.partition("_")[2]: folder
-        for folder in sorted((release / "sequences" / person).glob(f"{outfit}_*"))
-        if folder.is_dir()
-    }
+    places = [path for path in sorted((release / "sequences" / person).glob(f"{outfit}_?*")) if path.is_dir()]
+    folders = dict(zip(folder_names(path.name.partition("_")[2] for path in places), places, strict=True))
     splits = split_sequences(tuple(folders), request.config.test, request.config.ood)
     steps: Mapping[Split, int] = {
         "train": request.config.frame_step, "test": request.config.test_frame_step, "ood": request.config.ood_frame_step,

@@ -47,11 +47,11 @@ def read_cape_frame(path: Path, num_vertices: int) -> dict[str, NDArray[np.float
     Raises:
         UserError: the file cannot be read, lacks an array, or one does not fit.
     """
-    arrays = read_npz(path, "CAPE frame")
+    arrays = read_npz(path, "CAPE frame", only=_FRAME_SHAPES)
     for name, wanted in _FRAME_SHAPES.items():
         shape = tuple(num_vertices if size is None else size for size in wanted)
         if name not in arrays:
-            raise UserError(f"CAPE frame {path} has no '{name}'; it holds {', '.join(sorted(arrays)) or 'nothing'}")
+            raise UserError(f"CAPE frame {path} has no '{name}'; wanted {', '.join(_FRAME_SHAPES)}; unpack the archive again")
         array = arrays[name]
         if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
             raise UserError(f"CAPE frame {path}: {name} must be finite numbers of shape {list(shape)}, got {list(array.shape)}")

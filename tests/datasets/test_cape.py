@@ -50,6 +50,25 @@ def test_meshes_fit_the_bones(root: Path) -> None:
     assert find_source("cape").subjects(Request(DataConfig("cape", 2, 2, 2), root)) == ("00032_blazerlong", "00032_longshort")
 
 
+def test_only_what_is_needed_of_a_file_is_read(root: Path) -> None:
+    frame = root / "cape_release/sequences/00032/longshort_hips/longshort_hips.000001.npz"
+    with np.load(frame) as arrays:
+        content = dict(arrays)
+    np.savez(frame, **content, notes=np.array([{"a": 1}], object))  # a pickle inside, which nobody asked for
+    np.testing.assert_array_equal(load(root).sequences[0].frames, [0, 2, 4])
+    del content["transl"]
+    np.savez(frame, **content)
+    np.testing.assert_array_equal(load(root).sequences[0].frames, [2, 4])
+
+
+def test_names_stay_inside_the_store(root: Path) -> None:
+    folder = root / "cape_release" / "sequences" / "00032"
+    for name in ("longshort_", "longshort_..", "blazerlong_."):
+        (folder / name).mkdir()
+    subject = load(root, test=["tilt"])
+    assert {spec.name for spec in subject.sequences} | {name for name, _ in subject.broken} == {"clip", "hips", "squat", "tilt"}
+
+
 def test_broken_frames_are_left_out(root: Path, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     folder = root / "cape_release" / "sequences" / "00032"
     frame = folder / "longshort_hips" / "longshort_hips.000003.npz"

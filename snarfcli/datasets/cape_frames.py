@@ -15,6 +15,7 @@ from snarfcli.files import read_npz
 
 __all__ = ["CapeMeshes", "read_cape_frame"]
 
+_CHECKSUMS = 1024  # bytes; an .npz ends with the names, sizes and checksums of its arrays
 _FRAME_SHAPES = {"v_posed": (None, 3), "pose": (72,), "transl": (3,)}
 
 
@@ -38,7 +39,12 @@ class CapeMeshes:
         return CapeMeshes([self.paths[frame] for frame in frames], self.faces)
 
     def fingerprint(self) -> str:
-        return hashlib.sha256("\n".join(path.name for path in self.paths).encode()).hexdigest()[:16]
+        digest = hashlib.sha256()
+        for path in self.paths:
+            with path.open("rb") as file:
+                file.seek(max(0, path.stat().st_size - _CHECKSUMS))
+                digest.update(path.name.encode() + file.read(_CHECKSUMS))
+        return digest.hexdigest()[:16]
 
 
 def read_cape_frame(path: Path, num_vertices: int) -> dict[str, NDArray[np.float64]]:

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.datasets.store import file_digest
+
 if TYPE_CHECKING:
     from snarfcli.bodies import Body
 
@@ -149,6 +151,7 @@ class FileMeshes:
         return FileMeshes([self.paths[frame] for frame in frames], self.read, self.world_from_file)
 
     def fingerprint(self) -> str:
-        # Names and sizes, not times: a copy of a data set is the same data set.
-        sizes = "\n".join(f"{path.name} {path.stat().st_size}" for path in self.paths)
-        return hashlib.sha256(sizes.encode()).hexdigest()[:16]
+        # Names and contents, not times: a copy of a data set is the same. Sizes do not tell: a binary mesh keeps its size when
+        # it is mended.
+        contents = "\n".join(f"{path.name} {file_digest(path)}" for path in self.paths)
+        return hashlib.sha256(contents.encode()).hexdigest()[:16]

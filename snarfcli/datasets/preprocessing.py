@@ -209,7 +209,7 @@ def _complete_sequences(
             if there[name].shape != array.shape or not np.allclose(there[name], array, rtol=0.0, atol=_POSE_TOLERANCE)
         ]
         if not differs and entry.get("source") != spec.meshes.fingerprint():
-            differs = ["its files"]
+            raise UserError(f"{place} was made from other meshes (the files have changed); start again with overwrite=true")
         if differs:
             raise UserError(f"{place} was made from another motion ({differs[0]} differs); start again with overwrite=true")
         done[spec.split, spec.name] = entry

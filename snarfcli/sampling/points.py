@@ -46,6 +46,7 @@ _VERTEX_LEVELS = 1 << _VERTEX_BITS
 # of 10 in each cell) take 5 times as long; the spacing varies by 7 % then and by 10 % so, below noise as wide as the spacing.
 _POISSON_OPTIONS = {"montecarlorate": 6, "bestsampleflag": False}
 _POISSON_REQUEST = 0.93  # with these options it gives 1.11 times the samples asked for: some 3 % to spare
+_THINNEST = 1e-7  # distance of samples to length of the mesh; MeshLab never comes back from below 1e-10 (32-bit cells)
 
 
 @dataclass(frozen=True)
@@ -198,11 +199,15 @@ def surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generat
         [count, 3] float64, metres, in random order.
 
     Raises:
-        UserError: the surface has no area.
+        UserError: the surface has no area, or next to none for its length.
     """
     import pymeshlab
 
     corners, areas = _triangles(vertices, faces)
+    length = float(np.ptp(vertices, axis=0).max())
+    if np.sqrt(areas.sum() / max(1, count)) < _THINNEST * length:
+        size = f"{areas.sum():.3g} m^2, {length:.3g} m long"
+        raise UserError(f"mesh has next to no area ({size}), so nothing can be sampled on its surface; repair this frame")
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), faces.astype(np.int32)))
     meshes.generate_sampling_poisson_disk(samplenum=max(1, round(count * _POISSON_REQUEST)), **_POISSON_OPTIONS)
@@ -269,7 +274,10 @@ def sample_frame(
         boundary_edges: of the mesh; 0 says that it is closed, so that both inside tests can be compared.
     """
     count = settings.points_per_frame
-    cube_lower, cube_size = sampling_cube(vertices, settings.padding)
+    is_used = np.zeros(len(vertices), bool)
+    is_used[faces] = True
+    surface = vertices[is_used]  # what no face uses may lie anywhere
+    cube_lower, cube_size = sampling_cube(surface, settings.padding)
     uniform = cube_lower + generator.random((count // 2, 3)) * cube_size
     near = surface_samples(vertices, faces, count - count // 2, generator)
     near = near + generator.normal(scale=settings.surface_noise_m, size=near.shape)
@@ -284,8 +292,8 @@ def sample_frame(
         faces=faces.astype(np.int32),
         cube_lower=cube_lower,
         cube_size=cube_size,
-        box_lower=vertices.min(axis=0).astype(np.float32),
-        box_upper=vertices.max(axis=0).astype(np.float32),
+        box_lower=surface.min(axis=0).astype(np.float32),
+        box_upper=surface.max(axis=0).astype(np.float32),
         boundary_edges=boundary_edges,
         differing=int(labels_differ(winding).sum()) if boundary_edges == 0 else 0,
     )

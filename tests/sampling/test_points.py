@@ -75,6 +75,21 @@ def test_missing_samples_are_drawn_from_the_faces(monkeypatch: pytest.MonkeyPatc
 def test_a_surface_without_area_is_refused() -> None:
     with pytest.raises(UserError, match="no area"):
         surface_samples(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10, np.random.default_rng(0))
+    for height in (1e-18, 1e-160):  # MeshLab would go on for ever
+        thin = np.array([[0, 0, 0], [1, 0, 0], [0.5, height, 0]])
+        with pytest.raises(UserError, match="next to no area .*, 1 m long"):
+            surface_samples(thin, np.array([[0, 1, 2]]), 10_000, np.random.default_rng(0))
+
+
+def test_vertices_that_no_face_uses_do_not_count() -> None:
+    vertices, faces = capsule_mesh(0.5, 0.1)
+    settings = replace(_SETTINGS, points_per_frame=80)
+    alone = sample_frame(vertices, faces, settings, frame_generator(0))
+    beside = sample_frame(np.concatenate([vertices, [[40, 0, 0]]]), faces, settings, frame_generator(0))
+    for name in ("cube_lower", "cube_size", "box_lower", "box_upper"):
+        np.testing.assert_array_equal(getattr(beside, name), getattr(alone, name))
+    np.testing.assert_array_equal(beside.vertices[:-1], alone.vertices)
+    np.testing.assert_array_equal(beside.points[:40], alone.points[:40])
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
@@ -31,7 +32,7 @@ __all__ = [
 ]
 
 _PARTIAL = ".partial"
-_SPOOL = "vertices.spool"
+_SPOOL = "meshes.spool"
 
 
 def settings_digest(settings: Mapping[str, Any]) -> str:
@@ -67,7 +68,7 @@ class SequenceWriter:
         self._cubes = np.zeros((num_frames, 4), np.float32)
         self._boxes = np.zeros((num_frames, 2, 3), np.float32)
         self._inside = self._differing = self._boundary_edges = 0
-        self._topologies: list[np.ndarray] = []
+        self._topologies: dict[bytes, tuple[int, int, int]] = {}  # by digest: number, place in the spool, how many faces
         self._topology = np.zeros(num_frames, np.int64)
         self._spooled = np.zeros((num_frames, 2), np.int64)  # of each frame's vertices: their place in the spool, and how many
         self._points = self._occupancies = self._spool = None
@@ -99,12 +100,13 @@ class SequenceWriter:
         self._boundary_edges = max(self._boundary_edges, samples.boundary_edges)
 
     def _topology_of(self, faces: np.ndarray) -> int:
-        """Return the number of a list of faces among those seen so far, the last ones first."""
-        for number in reversed(range(len(self._topologies))):
-            if np.array_equal(self._topologies[number], faces):
-                return number
-        self._topologies.append(faces)
-        return len(self._topologies) - 1
+        """Return the number of a list of faces among those seen so far; a new one is spooled, as scans have one a frame."""
+        content = np.ascontiguousarray(faces, "<i4")
+        digest = hashlib.sha256(content.data).digest()
+        if digest not in self._topologies:
+            self._topologies[digest] = len(self._topologies), self._spool.tell(), len(content)
+            self._spool.write(content.data)
+        return self._topologies[digest][0]
 
     def finish(self, arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> dict[str, Any]:
         """Complete the sequence once every frame is written, and return what its `sequence.json` says.
@@ -115,16 +117,14 @@ class SequenceWriter:
         """
         self._points.close()
         self._occupancies.close()
-        vertex_start = self._write_vertices()
-        seen, topology = np.unique(self._topology, return_inverse=True)
-        order = np.argsort([int(np.argmax(self._topology == number)) for number in seen])  # by the first frame that has it
-        faces = [self._topologies[seen[number]] for number in order]
-        np.save(self._partial / "faces.npy", np.concatenate(faces).astype("<i4"))
-        meshes = {
-            "vertex_start": vertex_start,
-            "face_start": np.cumsum([0, *(len(part) for part in faces)]),
-            "topology": np.argsort(order)[topology],
-        }
+        vertex_start = self._write_spooled("vertices.npy", self._spooled, (), "<u8")
+        _, first, topology = np.unique(self._topology, return_index=True, return_inverse=True)
+        order = np.argsort(first)  # the topologies in the order in which the frames have them
+        places = np.array([place for _, *place in self._topologies.values()])
+        face_start = self._write_spooled("faces.npy", places[order], (3,), "<i4")
+        self._spool.close()
+        (self._partial / _SPOOL).unlink()
+        meshes = {"vertex_start": vertex_start, "face_start": face_start, "topology": np.argsort(order)[topology]}
         cubes = {"cube_lower": self._cubes[:, :3], "cube_size": self._cubes[:, 3]}
         boxes = {"box_lower": self._boxes[:, 0], "box_upper": self._boxes[:, 1]}
         write_arrays(self._partial / "frames.npz", {**arrays, **cubes, **boxes, **meshes})
@@ -146,16 +146,15 @@ class SequenceWriter:
         os.replace(self._partial, self.folder)
         return complete
 
-    def _write_vertices(self) -> np.ndarray:
-        """Write the spooled vertices in the order of the frames; return where each frame's start, [T + 1]."""
-        starts = np.concatenate([[0], np.cumsum(self._spooled[:, 1])])
-        file, _ = _start_array(self._partial / "vertices.npy", (int(starts[-1]),), "<u8")
+    def _write_spooled(self, name: str, places: np.ndarray, row: tuple[int, ...], dtype: str) -> np.ndarray:
+        """Write an array of parts of the spool, given by place and number of rows; return where each starts, and the end."""
+        starts = np.concatenate([[0], np.cumsum(places[:, 1])])
+        file, _ = _start_array(self._partial / name, (int(starts[-1]), *row), dtype)
+        size = np.dtype(dtype).itemsize * math.prod(row)
         with file:
-            for place, count in self._spooled:
+            for place, count in places:
                 self._spool.seek(int(place))
-                file.write(self._spool.read(int(count) * 8))
-        self._spool.close()
-        (self._partial / _SPOOL).unlink()
+                file.write(self._spool.read(int(count) * size))
         return starts
 
     def discard(self) -> None:

@@ -6,11 +6,14 @@ Targets are posed SMPL bodies; soft-tissue motion (dmpls) is left out (SNARF Sec
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
+from snarfcli.checks import check_choice
 from snarfcli.datasets.amass import amass_sequences, find_sequences, find_subjects, papers_split, read_person
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import Split, SubjectData, body_template
 from snarfcli.errors import UserError, nearest
+from snarfcli.motions.layouts import HANDS
 
 __all__ = ["load", "require_person_files", "subjects"]
 
@@ -56,12 +59,13 @@ def load(subject: str, request: Request) -> SubjectData:
     )
 
 
-def require_person_files(subject: str, request: Request):
+def require_person_files(subject: str, request: Request) -> tuple[dict[str, Path], dict[str, Split]]:
     """Return the files of a subject's sequences, and what each of the papers' sequences is for.
 
     Raises:
-        UserError: the subject is unknown, or there are no files of it.
+        UserError: the subject is unknown, there are no files of it, or data.hands is no choice.
     """
+    check_choice("data.hands", request.config.hands, HANDS)
     split = papers_split()["dfaust"]
     if subject not in split:
         raise UserError(f"no DFaust subject '{subject}'{nearest(subject, split)}; there is {', '.join(split)}")

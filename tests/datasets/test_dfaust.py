@@ -126,6 +126,15 @@ def test_poseprior_alone(old: Path) -> None:
     assert find_source("poseprior").subjects(Request(DataConfig("poseprior", 1, 1, 10), old)) == ("50002",)
 
 
+@pytest.mark.parametrize("data", ["dfaust", "poseprior"])
+def test_hands_are_one_of_two_choices(old: Path, data: str) -> None:
+    released, rest = load(old, data, hands="released"), load(old, data)
+    assert all(np.allclose(spec.motion.poses[:, 22:], 0.3) for spec in released.sequences)
+    assert not any(spec.motion.poses[:, 22:].any() for spec in rest.sequences)
+    with pytest.raises(UserError, match="data.hands must be rest or released, got 'fist'"):
+        load(old, data, hands="fist")
+
+
 def test_what_is_missing_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(UserError, match=r"no DFaust sequences of subject 50002 below .*DFaust_67/50002/50002_hips_poses.npz"):
         load(tmp_path)

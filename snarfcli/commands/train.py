@@ -39,8 +39,8 @@ log = logging.getLogger(__name__)
 
 _AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every")
 _NOT_NEGATIVE = (
-    "uniform_points", "surface_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight", "joint_weight",
-    "validation_frames", "refresh_cells_every", "workers",
+    "uniform_points", "surface_points", "far_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight",
+    "joint_weight", "validation_frames", "refresh_cells_every", "workers",
 )  # fmt: skip
 
 

@@ -248,6 +248,13 @@ class ForwardDeformer(nn.Module):
             return self._checked(self.field(canonical), len(canonical))
         return interpolate(self.weight_grid(), canonical, self.grid)
 
+    def random_canonical(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return canonical points [count, 3] spread evenly over the active cells, metres."""
+        cells = self.active_cells.nonzero()
+        chosen = torch.randint(len(cells), (count,), generator=generator).to(cells.device)
+        places = torch.rand(count, 3, generator=generator).to(self.lower)
+        return self.lower + (cells[chosen].flip(1) + places) * self.grid.cell_size(self.shape)
+
     def skin(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
         """Move canonical points [N, 3] into one pose [J, 4, 4]; the exact inverse of the search."""
         return skin(canonical, self.skinning_weights(canonical), bone_transforms)

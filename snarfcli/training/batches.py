@@ -17,7 +17,6 @@ from snarfcli.training.settings import TrainingConfig
 
 __all__ = ["Batch", "FrameBatches", "FreshBatches", "load_frames", "new_batches"]
 
-
 _MOST_WORKERS = 8  # of those that are not asked for; a batch of the largest preset takes one of them 0.13 s
 
 
@@ -33,6 +32,8 @@ class Batch:
     """[B, J, 4, 4], canonical to posed."""
     pose: Tensor
     """[B, J, 3] axis-angle, radians."""
+    cube: Tensor
+    """[B, 2, 3] lower and upper corner of the cube that holds a frame's points; outside it nothing is occupied. Metres."""
 
 
 class FrameBatches:
@@ -87,7 +88,6 @@ class FreshBatches(FrameBatches):
     there are cores.
     """
 
-
     def __init__(self, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> None:
         super().__init__(store, config, seed, device)
         self._fresh = FreshPoints(
@@ -132,9 +132,11 @@ def _gather(frames: list, points: np.ndarray, occupied: np.ndarray, device: torc
     """Put points [B, N, 3] and labels [B, N] together with the poses of their frames, given as tuples (sequence, frame)."""
     transforms = np.stack([sequence.bone_transforms[frame] for sequence, frame in frames])
     pose = np.stack([sequence.poses[frame] for sequence, frame in frames])
+    cube = np.stack([sequence.cube(frame) for sequence, frame in frames])
     return Batch(
         torch.as_tensor(points, dtype=torch.float32, device=device),
         torch.as_tensor(occupied, dtype=torch.bool, device=device),
         torch.as_tensor(transforms, dtype=torch.float32, device=device),
         torch.as_tensor(pose, dtype=torch.float32, device=device),
+        torch.as_tensor(cube, dtype=torch.float32, device=device),
     )

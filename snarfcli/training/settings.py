@@ -21,6 +21,8 @@ class TrainingConfig:
     """Points of a frame from the uniform half of its samples."""
     surface_points: int = MISSING
     """Points of a frame from the near-surface half of its samples."""
+    far_points: int = MISSING
+    """Points of a frame drawn in the canonical cells; those that it moves out of the cube of its samples are outside."""
     fresh_points: bool = MISSING
     """Draw and label new points in every step, from the meshes in the store, instead of choosing among the stored points."""
     workers: int | None = MISSING

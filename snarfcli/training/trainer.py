@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,13 @@ import torch
 from torch.nn import functional as F
 
 from snarfcli.datasets.store import SampleStore
+from snarfcli.deformer.skinning import skin
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import iou
 from snarfcli.models.avatar import Avatar
 from snarfcli.models.extent import bone_segments
 from snarfcli.precision import PRECISIONS, matmul_precision
-from snarfcli.training.batches import load_frames, new_batches
+from snarfcli.training.batches import Batch, load_frames, new_batches
 from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
 from snarfcli.training.settings import TrainingConfig
 
@@ -70,6 +71,8 @@ class Trainer:
         batch = self.batches.batch(self.step)
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
+        if self.config.far_points:
+            batch = self._with_far_points(batch)
         field = self.model(batch.points, batch.bone_transforms, batch.pose, self.config.precision)
         losses = {"occupancy": occupancy_loss(field.logits, batch.occupied, field.found)}
         if self.step < self.config.bootstrap_steps:
@@ -93,6 +96,24 @@ class Trainer:
         numbers |= {"total": total.item(), "inside_without_correspondence": lost.item()}
         numbers |= {"correspondences_per_point": field.correspondences / max(batch.occupied.numel(), 1)}
         return numbers
+
+    @torch.no_grad()
+    def _with_far_points(self, batch: Batch) -> Batch:
+        """Return the batch with points behind its own that lie outside the cubes of its frames, where nothing is occupied.
+
+        Nobody samples there, so a piece of the shape that every frame moves out of its cube would never be noticed, as one
+        beyond the nose of an animal. Points are drawn in the searched cells and moved as the frames do; one that stays inside
+        a cube, where it has no label, goes to where no cell reaches.
+        """
+        seed = int(np.random.default_rng([self.seed, self.step, 4]).integers(2**62))
+        canonical = self.model.deformer.random_canonical(self.config.far_points, torch.Generator().manual_seed(seed))
+        weights = self.model.deformer.field(canonical)  # not those between the grid's nodes, which would take them all
+        points = torch.stack([skin(canonical, weights, transforms) for transforms in batch.bone_transforms])
+        lower, upper = batch.cube[:, None, 0], batch.cube[:, None, 1]
+        is_far = ((points < lower) | (points > upper)).any(-1, keepdim=True)
+        points = torch.where(is_far, points, upper + 10 * (upper - lower))
+        occupied = torch.cat([batch.occupied, torch.zeros_like(is_far[..., 0])], 1)
+        return replace(batch, points=torch.cat([batch.points, points], 1), occupied=occupied)
 
     def learning_rate(self) -> float:
         """Return the learning rate of the coming step: linear warm-up, then a cosine down to the final rate."""

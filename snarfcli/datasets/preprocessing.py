@@ -172,7 +172,10 @@ def _write_subject(folder: Path, subject: SubjectData, inside_test: str) -> None
     if not path.exists():
         write_arrays(path, arrays)
         return
-    there = read_npz(path, "samples")
+    try:
+        there = read_npz(path, "samples")
+    except UserError:
+        raise UserError(f"the samples are damaged: {path} cannot be read; start again with overwrite=true") from None
     for name in sorted(arrays.keys() | there.keys()):
         same = name in arrays and name in there and there[name].shape == arrays[name].shape
         if same and arrays[name].dtype.kind == "f":
@@ -194,15 +197,19 @@ def _complete_sequences(
         place = folder / spec.split / spec.name
         if not (place / "sequence.json").exists():
             continue
-        entry = read_json(place / "sequence.json", "samples")
-        sizes = {name: (place / name).stat().st_size if (place / name).exists() else None for name in SEQUENCE_FILES}
-        if entry["settings_digest"] != settings_digest(settings) or any(
-            size is None or size != entry["files"].get(name, {}).get("bytes") for name, size in sizes.items()
-        ):
+        try:
+            entry = read_json(place / "sequence.json", "samples")
+            sizes = {name: entry["files"][name]["bytes"] for name in SEQUENCE_FILES}
+            is_whole = entry["settings_digest"] == settings_digest(settings)
+            is_whole &= all((place / name).is_file() and (place / name).stat().st_size == size for name, size in sizes.items())
+            there = read_npz(place / "frames.npz", "samples") if is_whole else {}
+        except (UserError, KeyError, TypeError):
+            is_whole = False
+        frames = _frame_numbers(spec, frame_steps)
+        wanted = _frame_arrays(subject.skeleton, spec, frames)
+        if not is_whole or not wanted.keys() <= there.keys():
             log.warning("%s/%s is damaged and is made again", spec.split, spec.name)
             continue
-        frames = _frame_numbers(spec, frame_steps)
-        there, wanted = read_npz(place / "frames.npz", "samples"), _frame_arrays(subject.skeleton, spec, frames)
         differs = [
             name
             for name, array in wanted.items()

@@ -143,10 +143,21 @@ def test_a_damaged_sequence_is_made_again(tmp_path: Path, subject: list[SubjectD
     few = {"sequences": ["fold"], "workers": 1}
     preprocess.run(_config(tmp_path, **few))
     before = _contents(tmp_path)
-    path = tmp_path / "processed" / "builtin" / "toy" / "ood" / "fold" / "points.npy"
-    path.write_bytes(path.read_bytes()[:-10])
-    preprocess.run(_config(tmp_path, **few))
-    assert _contents(tmp_path) == before
+    folder = tmp_path / "processed" / "builtin" / "toy"
+    place = folder / "ood" / "fold"
+    entry = json.loads((place / "sequence.json").read_text())
+    for name, content in {
+        "points.npy": before["ood/fold/points.npy"][:-10],
+        "frames.npz": bytes(len(before["ood/fold/frames.npz"])),
+        "sequence.json": json.dumps({**entry, "files": 3}).encode(),
+        "./sequence.json": json.dumps({name: entry[name] for name in ("format_version", "settings")}).encode(),
+    }.items():
+        (place / name).write_bytes(content)
+        preprocess.run(_config(tmp_path, **few))
+        assert _contents(tmp_path) == before
+    (folder / "subject.npz").write_bytes(b"PK")
+    with pytest.raises(UserError, match=r"damaged: .*subject.npz cannot be read; start again with overwrite=true"):
+        preprocess.run(_config(tmp_path, **few))
 
 
 def test_an_open_mesh_is_said_once(

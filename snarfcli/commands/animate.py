@@ -130,11 +130,12 @@ def run(config: AnimateConfig) -> int:
         UserError: there is no avatar or no motion, or a setting cannot be used.
     """
     size = _check(config)
-    subject_folder = run_folder(config.output_root, config.data.name, config.subject, config.run).parent
+    trained_on = config.data.avatars or config.data.name
+    subject_folder = run_folder(config.output_root, trained_on, config.subject, config.run).parent
     unknown = config.data.name == "builtin" and config.subject not in BUILTIN_SUBJECTS
     if unknown and config.ckpt is None and not subject_folder.exists():
         builtin_subject(config.subject)  # says which name is near
-    path = find_avatar(config.output_root, config.data.name, config.subject, config.run, config.ckpt)
+    path = find_avatar(config.output_root, trained_on, config.subject, config.run, config.ckpt)
     device = choose_device(config.device)
     set_threads(config.threads)
     avatar = Avatar.load(path, device)

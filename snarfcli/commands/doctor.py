@@ -82,8 +82,10 @@ def run(config: DoctorConfig) -> int:
 
 def _check_data(config: DoctorConfig, data: DataConfig) -> int:
     """Say whether a data set can be used, and what to mend; draw each subject that is looked at."""
-    from snarfcli.datasets.checking import check_subject
+    from snarfcli.datasets.checking import LookedAt, Remark, check_subject
     from snarfcli.datasets.sources import Request, find_source
+    from snarfcli.datasets.subjects import SubjectData
+    from snarfcli.export.bones import write_bones_figure
 
     request = Request(data, Path(config.data_root), config.body)
     subjects = [config.subject] if config.subject not in (None, "all") else list(find_source(data.name).subjects(request))
@@ -95,8 +97,13 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
         if config.figure is not None:
             figure = Path(config.figure)
             figure = figure if len(chosen) == 1 else figure.with_stem(f"{figure.stem}_{subject}")
+
+        def draw(data: SubjectData, frames: list[LookedAt], figure: Path = figure) -> Remark:
+            write_bones_figure(figure, f"{data.data} data, subject {data.subject}", data.skeleton, frames)
+            return Remark("figure", str(figure))
+
         log.info("subject %s", subject)
-        for remark in check_subject(subject, request, figure):
+        for remark in check_subject(subject, request, draw):
             mark = {"fact": "", "warning": "warning: ", "problem": "PROBLEM: "}[remark.kind]
             log.info("  %-16s%s%s", remark.name, mark, remark.text)
             if remark.kind == "problem" and subject not in unusable:

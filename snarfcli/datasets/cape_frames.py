@@ -38,6 +38,9 @@ class CapeMeshes:
     def chosen(self, frames: NDArray[np.int64]) -> CapeMeshes:
         return CapeMeshes([self.paths[frame] for frame in frames], self.faces)
 
+    def source(self, index: int) -> str:
+        return str(self.paths[index])
+
     def fingerprint(self) -> str:
         digest = hashlib.sha256()
         for path in self.paths:

@@ -1,11 +1,10 @@
-"""Is a data set fit to be learned from? What was found, what is missing, and a picture of meshes and bones together."""
+"""Is a data set fit to be learned from? What was found, and what is missing."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -58,21 +57,25 @@ class LookedAt:
     """[J, 3] posed joints, metres."""
 
 
-def check_subject(subject: str, request: Request, figure: Path) -> Iterator[Remark]:
-    """Yield what there is to say about one subject, and draw some of its frames.
+def check_subject(
+    subject: str, request: Request, draw: Callable[[SubjectData, list[LookedAt]], Remark] | None = None
+) -> Iterator[Remark]:
+    """Yield what there is to say about one subject.
 
     Nothing that is wrong with the data raises: it becomes the last remark.
+
+    Args:
+        subject: its id.
+        request: which data set, and where.
+        draw: makes a picture of some of its frames and says where it is.
     """
     seen: list[LookedAt] = []
     try:
         data = find_source(request.config.name).load(subject, request)
         yield from _about(data, seen)
-        if seen:
-            from snarfcli.datasets.check_figure import write_check_figure
-
-            some = [seen[index] for index in np.unique(np.linspace(0, len(seen) - 1, _FRAMES_DRAWN).round().astype(int))]
-            write_check_figure(figure, f"{data.data} data, subject {subject}", data.skeleton, some)
-            yield Remark("figure", str(figure))
+        if seen and draw is not None:
+            some = np.unique(np.linspace(0, len(seen) - 1, _FRAMES_DRAWN).round().astype(int))
+            yield draw(data, [seen[index] for index in some])
     except UserError as error:
         yield Remark("not usable", str(error), "problem")
     except Exception as error:  # what a check is for is not to break off
@@ -91,7 +94,8 @@ def _about(data: SubjectData, seen: list[LookedAt]) -> Iterator[Remark]:
         if not (np.isfinite(spec.motion.poses).all() and np.isfinite(spec.motion.translation).all()):
             yield Remark(spec.name, "has NaN or infinite poses; repair them", "problem")
             continue
-        for frame in np.unique(np.linspace(0, spec.motion.num_frames - 1, _FRAMES_LOOKED_AT).round().astype(int)):
+        usable = np.arange(spec.motion.num_frames) if spec.frames is None else spec.frames
+        for frame in usable[np.unique(np.linspace(0, len(usable) - 1, _FRAMES_LOOKED_AT).round().astype(int))]:
             label = f"{spec.name}, frame {frame}"
             try:
                 vertices, faces = spec.meshes[int(frame)]

@@ -44,6 +44,7 @@ from snarfcli.formats.surfaces import list_surfaces, read_surface
 
 __all__ = ["load", "subjects"]
 
+_SCALES = (1e-6, 1e6)  # metres a unit: from micrometres to what nobody has modelled
 _SKELETON_FILES = ("skeleton.json", "skeleton.npz", "skeleton.bvh")
 _POSE_FILES = ("poses.npz", "poses.json", "motion.bvh")
 _POSE_SUFFIXES = (".npz", ".json", ".bvh")
@@ -83,7 +84,7 @@ def load(subject: str, request: Request) -> SubjectData:
 
 # ---------------------------------------------------------------- where things are
 def _folder(request: Request) -> Path:
-    folder = Path(request.config.folder) if request.config.folder is not None else request.data_root / "meshes"
+    folder = request.folder if request.config.folder is not None else request.data_root / "meshes"
     if not folder.is_dir():
         kind = "is no folder" if folder.exists() else "is not there"
         raise UserError(f"the folder of meshes {folder} {kind}; give data.folder=FOLDER with {_WANTED}")
@@ -96,7 +97,10 @@ def _places(request: Request) -> dict[str, Path]:
     if _skeleton_files(folder):
         return {folder.absolute().name: folder}
     files = {path.stem: path for path in _files(folder, RIG_SUFFIXES)}
-    return dict(sorted((files | {path.name: path for path in _subfolders(folder) if not _what_is_missing(path)}).items()))
+    folders = {path.name: path for path in _subfolders(folder) if not _what_is_missing(path)}
+    for name in files.keys() & folders.keys():
+        raise UserError(f"{folder} has both {files[name].name} and a folder {name}; rename one of them")
+    return dict(sorted((files | folders).items()))
 
 
 def _find(subject: str, request: Request) -> Path:
@@ -252,11 +256,12 @@ def _subject(
     """Split the recordings and bring everything into the world."""
     skeleton = _world_skeleton(skeleton_file, world, config.canonical)
     test, ood = _patterns(place, config)
-    if len(recordings) == 1 and not test:
+    names = sorted([*(recording.name for recording in recordings), *(name for name, _ in broken)])
+    if len(names) == 1 and not test:
         recordings = recordings[0].halves()
         splits = {recording.name: "test" if index else "train" for index, recording in enumerate(recordings)}
-    else:
-        splits = split_sequences([recording.name for recording in recordings], test, ood)
+    else:  # broken ones count, so that mending them changes nothing about the others
+        splits = split_sequences(names, test, ood)
     specs = {recording.name: recording.to_sequence(splits[recording.name], skeleton, world) for recording in recordings}
     stretched = [name for name, spec in specs.items() if spec.posed_from_rest is not None]
     if stretched:
@@ -302,5 +307,6 @@ def _check(config: DataConfig) -> None:
             scale = float(config.scale)
         except ValueError:
             scale = math.nan
-        if not 0 < scale < math.inf:
-            raise UserError(f"data.scale must be auto or a positive number of metres a unit, got '{config.scale}'")
+        if not _SCALES[0] <= scale <= _SCALES[1]:
+            limits = f"between {_SCALES[0]:g} and {_SCALES[1]:g}"
+            raise UserError(f"data.scale must be auto or a number of metres a unit {limits}, got '{config.scale}'")

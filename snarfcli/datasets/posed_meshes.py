@@ -40,6 +40,10 @@ class PosedMeshes(Protocol):
         """Return the meshes of some frames."""
         ...
 
+    def source(self, index: int) -> str:
+        """Return the name of the file that a mesh is read from; empty if it is made otherwise."""
+        ...
+
     def fingerprint(self) -> str:
         """Return a word that changes when the files do that the meshes are read from; empty if there are none."""
         ...
@@ -62,6 +66,9 @@ class ArrayMeshes:
 
     def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
         return ArrayMeshes(self.vertices[frames], self.faces)
+
+    def source(self, index: int) -> str:
+        return ""
 
     def fingerprint(self) -> str:
         return ""
@@ -96,6 +103,9 @@ class BodyMeshes:
         ]
         return ArrayMeshes(torch.stack(posed).numpy().astype(np.float32), body.faces.numpy().astype(np.int32))
 
+    def source(self, index: int) -> str:
+        return ""
+
     def fingerprint(self) -> str:
         return ""
 
@@ -125,6 +135,9 @@ class RigMeshes:
         posed = np.einsum("tvrc,vc->tvr", blended[..., :3], self.vertices) + blended[..., 3]
         return ArrayMeshes(posed.astype(np.float32), self.faces.astype(np.int32))
 
+    def source(self, index: int) -> str:
+        return ""
+
     def fingerprint(self) -> str:
         return ""
 
@@ -149,6 +162,9 @@ class FileMeshes:
 
     def chosen(self, frames: NDArray[np.int64]) -> FileMeshes:
         return FileMeshes([self.paths[frame] for frame in frames], self.read, self.world_from_file)
+
+    def source(self, index: int) -> str:
+        return str(self.paths[index])
 
     def fingerprint(self) -> str:
         # Names and contents, not times: a copy of a data set is the same. Sizes do not tell: a binary mesh keeps its size when

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from snarfcli.bodies import Skeleton, invert_rigid
-from snarfcli.datasets.store import SEQUENCE_FILES, samples_folder
+from snarfcli.datasets.resuming import complete_sequences, frame_arrays, frame_numbers, write_subject
+from snarfcli.datasets.store import samples_folder
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.datasets.writing import (
     SequenceWriter,
@@ -23,21 +22,18 @@ from snarfcli.datasets.writing import (
     hold_folder,
     refuse_other_settings,
     remove_leftovers,
-    settings_digest,
-    write_arrays,
     write_manifest,
 )
 from snarfcli.errors import UserError, nearest
-from snarfcli.files import read_json, read_npz
 from snarfcli.progress import progress
-from snarfcli.sampling import BrokenFrame, SamplingSettings, check_mesh, run_in_processes, sample_frames
+from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, run_in_processes, sample_frames
 
 __all__ = ["preprocess_subject"]
 
 log = logging.getLogger(__name__)
 
 _FRAMES_PER_TASK = 30  # 3 to 4 s of work for 0.4 s of starting a process; the samples depend on it, see sampling/parallel
-_POSE_TOLERANCE = 1e-4  # radians and metres; the same motion on another machine differs by rounding only
+_FRAMES_CHECKED = 200  # that a process only reads
 _PACKAGES = ("snarf", "numpy", "torch", "libigl", "pymeshlab", "trimesh", "embreex")
 
 
@@ -92,12 +88,16 @@ def preprocess_subject(
     with hold_folder(folder):
         try:
             remove_leftovers(folder)
+            new = [spec for spec in chosen if overwrite or not (folder / spec.split / spec.name / "sequence.json").exists()]
+            unusable = _check_files(subject, new, frame_steps, sampling.inside_test, workers, skip_broken)
+            broken += unusable
+            chosen = [spec for spec in chosen if spec.name not in dict(unusable)]
             if overwrite:
                 discard_samples(folder)
             refuse_other_settings(folder, settings)
             started = time.monotonic()
-            _write_subject(folder, subject, sampling.inside_test)
-            done = _complete_sequences(folder, subject, settings, frame_steps)
+            write_subject(folder, subject, sampling.inside_test)
+            done = complete_sequences(folder, subject, settings, frame_steps)
             missing = [spec for spec in chosen if (spec.split, spec.name) not in done]
             if len(missing) < len(chosen):
                 log.info("%d of %d sequences are there already", len(chosen) - len(missing), len(chosen))
@@ -112,7 +112,7 @@ def preprocess_subject(
                 "data": subject.data,
                 "subject": subject.subject,
                 "sources": list(subject.sources),
-                "skipped": [{"name": name, "reason": reason} for name, reason in broken],
+                "skipped": [{"name": name, "reason": reason} for name, reason in dict([*subject.broken, *broken]).items()],
                 "settings": settings,
                 "versions": _versions(),
             }
@@ -138,120 +138,52 @@ def _report_broken(subject: SubjectData, names: Sequence[str], skip_broken: bool
     return broken
 
 
+def _check_files(
+    subject: SubjectData,
+    specs: Sequence[SequenceSpec],
+    frame_steps: Mapping[str, int],
+    inside_test: str,
+    workers: int,
+    skip_broken: bool,
+) -> list[tuple[str, str]]:
+    """Read every mesh that comes from a file once, before any other work: return the sequences that cannot be used, and why.
+
+    Raises:
+        UserError: there is one, and such sequences may not be left out.
+    """
+    frames = {spec.name: frame_numbers(spec, frame_steps) for spec in specs if spec.meshes.source(0)}
+    parts = [
+        (spec, frames[spec.name][start : start + _FRAMES_CHECKED])
+        for spec in specs
+        for start in range(0, len(frames.get(spec.name, ())), _FRAMES_CHECKED)
+    ]
+    if not parts:
+        return []
+    broken: dict[str, str] = {}
+    results = run_in_processes(
+        check_frames, ((spec.meshes.chosen(part), inside_test, spec.name, part) for spec, part in parts), workers
+    )
+    total = sum(len(part) for _, part in parts)
+    try:
+        for task, problem in progress(results, total=total, desc=f"checking {subject.subject}", unit="meshes"):
+            name = parts[task][0].name
+            if problem is None or name in broken:
+                continue
+            if not skip_broken:
+                raise UserError(f"{problem.message}; give skip_broken=true to leave such sequences out")
+            log.warning("left out: sequence %s (%s)", name, problem.message)
+            broken[name] = problem.message
+    finally:
+        results.close()
+    return list(broken.items())
+
+
 def _choose(subject: SubjectData, names: Sequence[str]) -> list[SequenceSpec]:
     known = [spec.name for spec in subject.sequences]
     for name in names:
         if name not in known and name not in (broken for broken, _ in subject.broken):
             raise UserError(f"subject {subject.subject} has no sequence '{name}'{nearest(name, known)}")
     return [spec for spec in subject.sequences if not names or spec.name in names]
-
-
-def _write_subject(folder: Path, subject: SubjectData, inside_test: str) -> None:
-    """Write `subject.npz`, or check that the one there is of the same subject."""
-    skeleton, template = subject.skeleton, subject.template
-    arrays = {
-        "names": np.array(skeleton.names),
-        "parents": np.array(skeleton.parents, np.int32),
-        "joints_rest": skeleton.joints_rest.numpy().astype(np.float32),
-        "canonical_pose": skeleton.canonical_pose.numpy().astype(np.float32),
-        "betas": np.asarray(subject.betas, np.float32),
-    }
-    if template is not None:
-        boundary_edges = check_mesh(template.vertices, template.faces, inside_test, f"the mesh of subject {subject.subject}")
-        if boundary_edges:
-            log.warning(
-                "the mesh of subject %s is open, %d boundary edges: labelled by winding number, inside is above a half",
-                subject.subject, boundary_edges,
-            )  # fmt: skip
-        arrays |= {
-            "faces": template.faces.astype(np.int32),
-            "vertices_canonical": template.vertices.astype(np.float32),
-            "vertex_weights": template.weights.astype(np.float32),
-        }
-    path = folder / "subject.npz"
-    if not path.exists():
-        write_arrays(path, arrays)
-        return
-    try:
-        there = read_npz(path, "samples")
-    except UserError:
-        raise UserError(f"the samples are damaged: {path} cannot be read; start again with overwrite=true") from None
-    for name in sorted(arrays.keys() | there.keys()):
-        same = name in arrays and name in there and there[name].shape == arrays[name].shape
-        if same and arrays[name].dtype.kind == "f":
-            same = np.allclose(there[name], arrays[name], rtol=0.0, atol=_POSE_TOLERANCE)
-        elif same:
-            same = np.array_equal(there[name], arrays[name])
-        if not same:
-            raise UserError(
-                f"the samples in {folder} were made from another body ({name} differs); start again with overwrite=true"
-            )
-
-
-def _complete_sequences(
-    folder: Path, subject: SubjectData, settings: Mapping[str, Any], frame_steps: Mapping[str, int]
-) -> dict[tuple[str, str], dict[str, Any]]:
-    """Return the descriptions of the sequences that need not be made again, by split and name."""
-    done = {}
-    for spec in subject.sequences:
-        place = folder / spec.split / spec.name
-        if not (place / "sequence.json").exists():
-            continue
-        try:
-            entry = read_json(place / "sequence.json", "samples")
-            sizes = {name: entry["files"][name]["bytes"] for name in SEQUENCE_FILES}
-            is_whole = entry["settings_digest"] == settings_digest(settings)
-            is_whole &= all((place / name).is_file() and (place / name).stat().st_size == size for name, size in sizes.items())
-            there = read_npz(place / "frames.npz", "samples") if is_whole else {}
-        except (UserError, KeyError, TypeError):
-            is_whole = False
-        frames = _frame_numbers(spec, frame_steps)
-        wanted = _frame_arrays(subject.skeleton, spec, frames)
-        if not is_whole or not wanted.keys() <= there.keys():
-            log.warning("%s/%s is damaged and is made again", spec.split, spec.name)
-            continue
-        differs = [
-            name
-            for name, array in wanted.items()
-            if there[name].shape != array.shape or not np.allclose(there[name], array, rtol=0.0, atol=_POSE_TOLERANCE)
-        ]
-        if not differs and entry.get("source") != spec.meshes.fingerprint():
-            raise UserError(f"{place} was made from other meshes (the files have changed); start again with overwrite=true")
-        if differs:
-            raise UserError(f"{place} was made from another motion ({differs[0]} differs); start again with overwrite=true")
-        done[spec.split, spec.name] = entry
-    return done
-
-
-def _frame_numbers(spec: SequenceSpec, frame_steps: Mapping[str, int]) -> np.ndarray:
-    """Return the numbers of the frames to sample."""
-    if spec.frames is not None:
-        return np.asarray(spec.frames, np.int64)
-    return np.arange(0, spec.motion.num_frames, frame_steps[spec.split])
-
-
-def _frame_arrays(skeleton: Skeleton, spec: SequenceSpec, frames: np.ndarray) -> dict[str, np.ndarray]:
-    """Return what `frames.npz` says about the chosen frames: float32, metres and radians."""
-    skeleton = skeleton.to(torch.float64)
-    pose = torch.from_numpy(spec.motion.poses[frames])
-    translation = torch.from_numpy(spec.motion.translation[frames])
-    if spec.posed_from_rest is None:
-        posed_from_rest = skeleton.posed_from_rest(pose, translation)
-    else:
-        posed_from_rest = torch.from_numpy(spec.posed_from_rest[frames])
-    canonical_from_rest = skeleton.posed_from_rest(skeleton.canonical_pose[None])
-    joints = torch.einsum("tjrc,jc->tjr", posed_from_rest[..., :3, :3], skeleton.joints_rest) + posed_from_rest[..., :3, 3]
-    arrays = {
-        "poses": pose,
-        "translation": translation,
-        "posed_from_canonical": posed_from_rest @ invert_rigid(canonical_from_rest),
-        "joints": joints,
-    }
-    for name, array in arrays.items():
-        bad = np.flatnonzero(~array.isfinite().flatten(1).all(1).numpy())
-        if len(bad):
-            raise UserError(f"{spec.name} has NaN or infinite {name} in frame {frames[bad[0]]}; repair its poses first")
-    return {name: array.numpy().astype(np.float32) for name, array in arrays.items()} | {"frame_numbers": frames}
 
 
 def _make_sequences(
@@ -273,8 +205,8 @@ def _make_sequences(
 
     def tasks() -> Iterator[tuple[Any, ...]]:
         for spec in specs:
-            frames = _frame_numbers(spec, steps)
-            arrays = _frame_arrays(subject.skeleton, spec, frames)
+            frames = frame_numbers(spec, steps)
+            arrays = frame_arrays(subject.skeleton, spec, frames)
             writer = SequenceWriter(folder / spec.split / spec.name, len(frames), sampling.points_per_frame)
             job = _Job(spec, arrays, writer, len(frames))
             jobs.append(job)
@@ -286,7 +218,7 @@ def _make_sequences(
                 yield spec.meshes.chosen(part), sampling, (subject.subject, spec.name), part
 
     made = []
-    total = sum(len(_frame_numbers(spec, steps)) for spec in specs)
+    total = sum(len(frame_numbers(spec, steps)) for spec in specs)
     results = run_in_processes(sample_frames, tasks(), workers)
     try:
         for task, samples in progress(results, total=total, desc=f"preprocess {subject.subject}", unit="frames"):

@@ -30,7 +30,7 @@ class Request:
     @property
     def folder(self) -> Path:
         """Where the files of the data set are looked for."""
-        return Path(self.config.folder) if self.config.folder is not None else self.data_root
+        return Path(self.config.folder).expanduser() if self.config.folder is not None else self.data_root
 
 
 class Source(Protocol):

@@ -54,7 +54,7 @@ SEQUENCE_FILES = ("points.npy", "occupancies.npy", "vertices.npy", "faces.npy", 
 
 _VALIDATION_SHARE = 0.1
 _ADVICE = {
-    "train": 'run "snarf preprocess" with training sequences',
+    "train": "preprocess training sequences, or name data that has some (poseprior has none)",
     "test": "evaluate out of distribution (--ood), or preprocess held-out sequences (data.test=[NAME])",
     "ood": "leave out --ood, or preprocess out-of-distribution sequences (data.ood=[NAME]; PosePrior for dfaust)",
 }

@@ -24,6 +24,7 @@ __all__ = [
     "BrokenFrame",
     "FrameSamples",
     "SamplingSettings",
+    "check_frames",
     "dequantise",
     "frame_generator",
     "pack_vertices",
@@ -118,6 +119,8 @@ class Meshes(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def source(self, index: int) -> str: ...
 
 
 def frame_generator(seed: int, *names: str | int) -> np.random.Generator:
@@ -313,23 +316,50 @@ def sample_frames(
     Yields:
         The samples of each frame, or what is wrong with the first one that cannot be used.
     """
-    checked: np.ndarray | None = None
-    for index, frame in enumerate(frames):
-        where = f"{names[-1]}, frame {frame}"
-        try:
-            vertices, faces = meshes[index]
-            if checked is None or faces is not checked:
-                boundary_edges = check_mesh(vertices, faces, settings.inside_test, f"{where}: the mesh")
-                checked = faces
-            else:
-                check_vertices(vertices, f"{where}: the mesh")
-        except UserError as error:
-            yield BrokenFrame(str(error))
+    for index, (mesh, where) in enumerate(_checked_meshes(meshes, settings.inside_test, names[-1], frames)):
+        if isinstance(mesh, BrokenFrame):
+            yield mesh
             return
-        generator = frame_generator(settings.seed, *names, int(frame))
+        vertices, faces, boundary_edges = mesh
+        generator = frame_generator(settings.seed, *names, int(frames[index]))
         try:
             samples = sample_frame(vertices, faces, settings, generator, boundary_edges=boundary_edges)
         except UserError as error:
             yield BrokenFrame(f"{where}: {error}")
             return
         yield samples
+
+
+def check_frames(meshes: Meshes, inside_test: str, sequence: str, frames: Sequence[int]) -> Iterator[BrokenFrame | None]:
+    """Read one posed mesh after another, and yield None for each that can be used, or what is wrong with the first that cannot.
+
+    Args:
+        meshes: T meshes.
+        inside_test: one of `INSIDE_TESTS`.
+        sequence: its name, for messages.
+        frames: [T] frame numbers within the sequence.
+    """
+    for mesh, _ in _checked_meshes(meshes, inside_test, sequence, frames):
+        yield mesh if isinstance(mesh, BrokenFrame) else None
+
+
+def _checked_meshes(
+    meshes: Meshes, inside_test: str, sequence: str, frames: Sequence[int]
+) -> Iterator[tuple[tuple[np.ndarray, np.ndarray, int] | BrokenFrame, str]]:
+    """Yield vertices, faces and number of boundary edges of each mesh, and what to call it, until one is broken."""
+    checked: np.ndarray | None = None
+    boundary_edges = 0
+    for index, frame in enumerate(frames):
+        file = meshes.source(index)
+        where = f"{sequence}, frame {frame}" + (f" ({file})" if file else "")
+        try:
+            vertices, faces = meshes[index]
+            if checked is None or faces is not checked:
+                boundary_edges = check_mesh(vertices, faces, inside_test, f"{where}: the mesh")
+                checked = faces
+            else:
+                check_vertices(vertices, f"{where}: the mesh")
+        except UserError as error:
+            yield BrokenFrame(str(error)), where
+            return
+        yield (vertices, faces, boundary_edges), where

@@ -12,17 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 from toy_subject import toy_body, toy_subject
 
 from snarfcli.commands import preprocess
 from snarfcli.commands.preprocess import PreprocessConfig
-from snarfcli.datasets.posed_meshes import PosedMeshes
+from snarfcli.datasets.posed_meshes import FileMeshes, PosedMeshes
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.store import SampleStore
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.datasets.writing import SequenceWriter
 from snarfcli.errors import UserError
+from snarfcli.formats.surfaces import read_surface
 from snarfcli.sampling import occupancies
 
 
@@ -224,6 +226,9 @@ class _FailsAt:
         part.frames = frames
         return part
 
+    def source(self, index: int) -> str:
+        return ""
+
     def fingerprint(self) -> str:
         return ""
 
@@ -250,3 +255,33 @@ def test_a_broken_sequence_stops_the_run_or_is_left_out(
     assert "left out: sequence lost (lost.npz is truncated)" in caplog.text
     assert "left out: sequence bend (mesh 000031.obj is damaged)" in caplog.text
     assert not list(tmp_path.rglob(".*"))
+
+
+def test_files_are_read_before_anything_is_lost(
+    tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "files"
+    folder.mkdir()
+    specs = []
+    for spec in subject[0].sequences[1:]:
+        paths = []
+        for frame in range(len(spec.meshes)):
+            paths.append(folder / f"{spec.name}_{frame}.ply")
+            trimesh.Trimesh(*spec.meshes[frame], process=False).export(paths[-1])
+        specs.append(replace(spec, meshes=FileMeshes(paths, read_surface, np.eye(4))))
+    subject[0] = replace(subject[0], sequences=tuple(specs))
+    data = tmp_path / "data"
+    preprocess.run(_config(data))
+    before = _contents(data)
+    last = folder / "fold_1.ply"
+    last.write_bytes(last.read_bytes()[:-100])
+    with pytest.raises(UserError, match=r"fold_1\.ply.*; give skip_broken=true"):
+        preprocess.run(_config(data, overwrite=True))
+    assert _contents(data) == before  # what was there is still there
+    with pytest.raises(UserError, match="fold was made from other meshes .* delete it to make it anew"):
+        preprocess.run(_config(data))
+    preprocess.run(_config(data, overwrite=True, skip_broken=True))
+    manifest = json.loads(_contents(data)["manifest.json"])
+    assert [entry["name"] for entry in manifest["sequences"]] == ["wave"]
+    assert [entry["name"] for entry in manifest["skipped"]] == ["fold"]
+    assert "left out: sequence fold" in caplog.text and "fold_1.ply" in caplog.text

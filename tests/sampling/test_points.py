@@ -14,6 +14,7 @@ from snarfcli.errors import UserError
 from snarfcli.sampling import (
     BrokenFrame,
     SamplingSettings,
+    check_frames,
     dequantise,
     frame_generator,
     quantise,
@@ -102,13 +103,24 @@ def test_vertices_that_no_face_uses_do_not_count() -> None:
     ],
 )
 @pytest.mark.parametrize("first", [True, False])
-def test_a_frame_that_cannot_be_used_is_named(scale: list[float], message: str, first: bool) -> None:
+@pytest.mark.parametrize("file", ["", "0007.ply"])
+def test_a_frame_that_cannot_be_used_is_named(scale: list[float], message: str, first: bool, file: str) -> None:
+    class Meshes(list):
+        def source(self, index: int) -> str:
+            return file
+
     vertices, faces = capsule_mesh(0.5, 0.1)
-    meshes = ([] if first else [(vertices, faces)]) + [(vertices * scale, faces), (vertices, faces)]
+    meshes = Meshes(([] if first else [(vertices, faces)]) + [(vertices * scale, faces), (vertices, faces)])
     settings = replace(_SETTINGS, points_per_frame=80)
     *good, broken = sample_frames(meshes, settings, ("fox", "walk"), [7, 8] if first else [5, 7, 8])
     assert len(good) == (0 if first else 1)
+    message = message.replace("frame 7", f"frame 7 \\({file}\\)") if file else message
     assert isinstance(broken, BrokenFrame) and re.match(message, broken.message)
+    checks = list(check_frames(meshes, "winding", "walk", [7, 8] if first else [5, 7, 8]))
+    if "no area" in message:
+        assert checks == [None] * len(meshes)  # that shows when it is sampled
+    else:
+        assert len(checks) == len(good) + 1 and checks[-1] == broken
 
 
 def test_frame_has_both_kinds_of_points() -> None:

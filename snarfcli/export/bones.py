@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from snarfcli.bodies import Skeleton
-from snarfcli.datasets.checking import LookedAt
 from snarfcli.export.camera import Camera
 from snarfcli.export.lighting import Look
 from snarfcli.export.render import render
 from snarfcli.export.sheet import contact_sheet, write_png
 from snarfcli.meshing.mesh import Mesh
 
-__all__ = ["write_check_figure"]
+__all__ = ["BonedMesh", "write_bones_figure"]
 
 _PANEL = 360  # pixels
 _VIEWS = (("from the front", 20.0), ("from the side", 100.0))
@@ -25,8 +25,17 @@ _BONE, _JOINT, _ROOT, _RIM = (235, 94, 40), (255, 214, 102), (200, 30, 120), (40
 _LOOK = Look(body=(0.62, 0.68, 0.74))  # paler than usual, so that the bones stand out
 
 
-def write_check_figure(path: Path, title: str, skeleton: Skeleton, frames: Sequence[LookedAt]) -> None:
-    """Draw each frame from two sides, bones over the mesh, and write the sheet as PNG."""
+class BonedMesh(Protocol):
+    """A posed mesh with its posed joints."""
+
+    label: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    joints: np.ndarray
+
+
+def write_bones_figure(path: Path, title: str, skeleton: Skeleton, frames: Sequence[BonedMesh]) -> None:
+    """Draw each frame from two sides, bones over the mesh, and write the sheet as PNG, whole or not at all."""
     rows = []
     for _, azimuth_deg in _VIEWS:
         rows.append([_panel(skeleton, frame, math.radians(azimuth_deg)) for frame in frames])
@@ -35,7 +44,7 @@ def write_check_figure(path: Path, title: str, skeleton: Skeleton, frames: Seque
     write_png(path, sheet)
 
 
-def _panel(skeleton: Skeleton, frame: LookedAt, azimuth_rad: float) -> np.ndarray:
+def _panel(skeleton: Skeleton, frame: BonedMesh, azimuth_rad: float) -> np.ndarray:
     from PIL import Image, ImageDraw
 
     mesh = Mesh(frame.vertices.astype(np.float32), frame.faces.astype(np.int32))

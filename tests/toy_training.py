@@ -13,7 +13,7 @@ from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.models.avatar import Avatar
 from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
 from snarfcli.sampling import SamplingSettings
-from snarfcli.shape import ShapeConfig
+from snarfcli.shape import ConditionConfig, ShapeConfig
 from snarfcli.training.extent import rough_canonical_surface
 from snarfcli.training.settings import TrainingConfig
 
@@ -27,7 +27,7 @@ def toy_store(root: Path, points: int = 800, frames: int = 34) -> SampleStore:
     return SampleStore.open(root, "builtin", "toy")
 
 
-def avatar_config(*, capsules: bool = False, **search: object) -> AvatarConfig:
+def avatar_config(*, capsules: bool = False, condition: str = "global", **search: object) -> AvatarConfig:
     """Return networks of a size that trains in seconds; with `capsules` the shape starts as one around the only bone."""
     skinning = SkinningConfig(
         resolution=[16, 12, 8], margin_m=[0.05, 0.05, 0.05], width=32, depth=2, weight_norm=False, prior_falloff_m=0.03
@@ -36,7 +36,7 @@ def avatar_config(*, capsules: bool = False, **search: object) -> AvatarConfig:
         width=32, depth=3, activation="relu", skip_layers=[], frequencies=[4.0], condition_layer=2, condition_size=4,
         condition_at_start=False, geometric_init=not capsules, weight_norm=False, prior_radius_m=0.07 if capsules else None,
     )  # fmt: skip
-    return AvatarConfig(ModelConfig(), skinning, SearchConfig(**search), shape)
+    return AvatarConfig(ModelConfig(), skinning, SearchConfig(**search), shape, ConditionConfig(condition))
 
 
 def training_config(**changes: object) -> TrainingConfig:

@@ -26,7 +26,7 @@ from snarfcli.models.preset import read_preset_weights
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
-from snarfcli.shape import ShapeConfig
+from snarfcli.shape import CONDITIONS, ConditionConfig, ShapeConfig
 from snarfcli.training.extent import rough_canonical_surface
 from snarfcli.training.loop import train
 from snarfcli.training.losses import JOINT_TARGETS
@@ -60,6 +60,8 @@ class TrainConfig:
     """The correspondence search."""
     shape: ShapeConfig = MISSING
     """The canonical occupancy network."""
+    condition: ConditionConfig = MISSING
+    """What of the pose each canonical point is told."""
     training: TrainingConfig = MISSING
     """Steps, batches, losses."""
     data_root: str = MISSING
@@ -159,6 +161,7 @@ def _check(config: TrainConfig) -> None:
     check_choice("training.precision", training.precision, PRECISIONS)
     check_choice("training.joint_target", training.joint_target, JOINT_TARGETS)
     check_choice("shape.name", config.shape.name, ("mlp",))
+    check_choice("condition.name", config.condition.name, CONDITIONS)
     for name in ("width", "depth"):
         check_number(f"shape.{name}", getattr(config.shape, name), 1)
     check_skinning(config.skinning, config.search)
@@ -177,7 +180,7 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
         shape = tuple(skinning.resolution[::-1])
         field = read_preset_weights(skinning.weights_file, grid, shape, store.skeleton.num_joints)
     avatar = Avatar(
-        AvatarConfig(config.model, skinning, search, config.shape),
+        AvatarConfig(config.model, skinning, search, config.shape, config.condition),
         store.skeleton,
         grid,
         surface,

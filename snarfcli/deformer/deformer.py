@@ -105,6 +105,7 @@ class ForwardDeformer(nn.Module):
         if active_cells is not None:
             self.set_active_cells(active_cells)
         self._frozen: Tensor | None = None
+        self._recent: Tensor | None = None
         self.register_load_state_dict_post_hook(_take_over_box)
 
     @property
@@ -160,7 +161,7 @@ class ForwardDeformer(nn.Module):
         return super().train(mode)
 
     def _apply(self, fn, recurse=True):
-        self._frozen = None
+        self._frozen = self._recent = None
         return super()._apply(fn, recurse)
 
     def forward(self, points: Tensor, bone_transforms: Tensor, capacity: int | None = None) -> Correspondences:
@@ -179,6 +180,7 @@ class ForwardDeformer(nn.Module):
             complete = name == "complete"
             active = self.active_cells if complete else None
             weights = self.weight_grid(active_only=complete)
+            self._recent = weights.detach()
             own = isinstance(self.field, WeightField)  # its weights sum to one
             if own:
                 check_transforms(bone_transforms)
@@ -254,6 +256,22 @@ class ForwardDeformer(nn.Module):
         chosen = torch.randint(len(cells), (count,), generator=generator).to(cells.device)
         places = torch.rand(count, 3, generator=generator).to(self.lower)
         return self.lower + (cells[chosen].flip(1) + places) * self.grid.cell_size(self.shape)
+
+    @torch.no_grad()
+    def remember_weights(self) -> None:
+        """Evaluate the weights at the nodes of active cells for `recent_weights`, as a search does."""
+        if not self.searches_field and self._frozen is None:
+            self._recent = self.weight_grid(active_only=True)
+
+    @torch.no_grad()
+    def recent_weights(self, canonical: Tensor) -> Tensor:
+        """Return the skinning weights [N, J] at canonical points [N, 3] as of the last search, without a gradient.
+
+        In training this spares evaluating the field at the nodes once more; points lie in active cells.
+        """
+        if self.searches_field or self._recent is None or self._frozen is not None:
+            return self.skinning_weights(canonical)
+        return interpolate(self._recent, canonical, self.grid)
 
     def skin(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
         """Move canonical points [N, 3] into one pose [J, 4, 4]; the exact inverse of the search."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +23,7 @@ from snarfcli.deformer import (
 from snarfcli.deformer.cells import corners_of
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.precision import network_precision
-from snarfcli.shape import OccupancyNetwork, ShapeConfig
+from snarfcli.shape import CONDITIONS, ConditionConfig, OccupancyNetwork, ShapeConfig, joints_of_bones
 
 __all__ = ["AvatarConfig", "FastSnarf", "FieldSamples", "ModelConfig", "NO_CORRESPONDENCE", "blend"]
 
@@ -59,6 +59,7 @@ class AvatarConfig:
     skinning: SkinningConfig
     search: SearchConfig
     shape: ShapeConfig
+    condition: ConditionConfig = field(default_factory=ConditionConfig)
 
 
 @dataclass
@@ -114,7 +115,11 @@ class FastSnarf(nn.Module):
             grid, num_bones, skinning, config.search, active, prior, parents=skeleton.parents, field=field
         )
         self.register_buffer("_kept_cells", kept, persistent=False)
-        self.shape = OccupancyNetwork(config.shape, 3 * (num_bones - 1), bones)
+        if config.condition.name not in CONDITIONS:
+            raise ValueError(f"condition.name must be one of {', '.join(CONDITIONS)}, got {config.condition.name!r}")
+        pose_size = 0 if config.condition.name == "none" else 3 * (num_bones - 1)
+        self.shape = OccupancyNetwork(config.shape, pose_size, bones)
+        self.register_buffer("_joints_of_bones", joints_of_bones(skeleton.parents), persistent=False)
 
     def condition(self, pose: Tensor) -> Tensor:
         """Return the pose condition [B, 3 (J - 1)]: joint angles without the global orientation, in half turns."""
@@ -157,6 +162,7 @@ class FastSnarf(nn.Module):
             precision: of the shape network.
         """
         deformer = self.deformer
+        deformer.remember_weights()
         size = deformer.grid.cell_size(deformer.shape)
         finer = (size / _SAMPLES_M).ceil().long()
         reach = (reach_m * finer / size - 1e-3).ceil().long().clamp_min(0).tolist()[::-1]
@@ -204,10 +210,25 @@ class FastSnarf(nn.Module):
         with network_precision(precision, canonical.device):
             if torch.is_grad_enabled():
                 extra = -len(canonical) % _ROUND_NUMBER if canonical.device.type == "cpu" else 0
-                padded = self.shape(F.pad(canonical, (0, 0, 0, extra)), condition, F.pad(pose, (0, extra)))
+                points = F.pad(canonical, (0, 0, 0, extra))
+                padded = self.shape(points, condition, F.pad(pose, (0, extra)), self.seen_joints(points))
                 return padded[: len(canonical)].to(canonical.dtype)
             chunks = zip(canonical.split(_POINTS_AT_ONCE), pose.split(_POINTS_AT_ONCE), strict=True)
-            return torch.cat([self.shape(points, condition, index) for points, index in chunks]).to(canonical.dtype)
+            logits = [self.shape(points, condition, index, self.seen_joints(points)) for points, index in chunks]
+            return torch.cat(logits).to(canonical.dtype)
+
+    @torch.no_grad()
+    def seen_joints(self, canonical: Tensor) -> Tensor | None:
+        """Return how much canonical points [M, 3] see of each joint but the root, [M, J - 1], 0 to 1; None: all of each.
+
+        A point sees the joints that bound the bones which move it. No gradient reaches the weights this way: that the shape
+        could be mended by seeing other joints is no reason for a point to follow other bones.
+
+        Source: after SCANimate (Saito et al., CVPR 2021), which masks the pose by skinning weights.
+        """
+        if self.config.condition.name != "local":
+            return None
+        return self.deformer.recent_weights(canonical) @ self._joints_of_bones
 
 
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:

@@ -1,5 +1,6 @@
 """Canonical shapes: pose-conditioned occupancy as a function of the canonical point."""
 
+from snarfcli.shape.condition import CONDITIONS, ConditionConfig, joints_of_bones
 from snarfcli.shape.network import OccupancyNetwork, ShapeConfig
 
-__all__ = ["OccupancyNetwork", "ShapeConfig"]
+__all__ = ["CONDITIONS", "ConditionConfig", "OccupancyNetwork", "ShapeConfig", "joints_of_bones"]

@@ -97,13 +97,15 @@ class OccupancyNetwork(nn.Module):
             if joined and not self.config.condition_at_start:
                 layer.weight[:, -joined:] = 0
 
-    def forward(self, canonical: Tensor, condition: Tensor, pose: Tensor) -> Tensor:
+    def forward(self, canonical: Tensor, condition: Tensor, pose: Tensor, seen: Tensor | None = None) -> Tensor:
         """Return occupancy logits [M] at canonical points [M, 3], metres.
 
         Args:
             canonical: points [M, 3], metres.
             condition: pose condition of each pose, [B, C].
             pose: index of each point's pose, [M], 0 to B - 1.
+            seen: how much each point sees of each part of the condition, [M, P], where C is P parts of equal length; all of
+                it if None.
         """
         encoded = self._encode(canonical)
         h = encoded
@@ -113,8 +115,11 @@ class OccupancyNetwork(nn.Module):
             if self.conditioned and index == self.config.condition_layer:
                 weight = layer.weight
                 points = h.shape[1]
-                per_pose = self.pose_code(condition) @ weight[:, points:].T + layer.bias
-                h = F.linear(h, weight[:, :points]) + per_pose.index_select(0, pose)
+                if seen is None:
+                    code = (self.pose_code(condition) @ weight[:, points:].T + layer.bias).index_select(0, pose)
+                else:
+                    code = self._local_code(condition, pose, seen) @ weight[:, points:].T + layer.bias
+                h = F.linear(h, weight[:, :points]) + code
             else:
                 h = layer(h)
             if index < len(self.layers) - 1:
@@ -124,6 +129,15 @@ class OccupancyNetwork(nn.Module):
             distance = distance_to_segments(canonical, self.bones)
             logits = logits + _LOGITS_PER_METRE * (self.config.prior_radius_m - distance)
         return logits
+
+    def _local_code(self, condition: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
+        """Return the pose code [M, K] of each point, made of what it sees of the condition."""
+        parts = seen.shape[1]
+        mapping = self.pose_code.weight.unflatten(1, (parts, -1))  # [K, P, C / P]
+        codes = torch.einsum("bpc,kpc->pbk", condition.unflatten(1, (parts, -1)), mapping)
+        every = (seen @ codes.flatten(1)).unflatten(1, (len(condition), -1))  # of every pose, which is a small product
+        chosen = pose[:, None, None].expand(-1, 1, every.shape[2])
+        return every.gather(1, chosen)[:, 0] + self.pose_code.bias
 
     def _encode(self, canonical: Tensor) -> Tensor:
         """Return points with their sine and cosine encoding, [M, 3 + 6 F]."""

@@ -48,20 +48,27 @@ def test_learns_shape_and_weights(store, tmp_path):
     assert float((inside & truth).sum() / (inside | truth).sum()) > 0.6  # bent further than ever seen
 
 
-def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path):
-    changes = {"steps": 12, "refresh_cells_every": 5}  # the searched cells change before the interruption and after it
-    whole = trainer_for(store, **changes)
+@pytest.mark.parametrize(("condition", "interrupted_at"), [("global", 7), ("local", 10)])
+def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path, condition, interrupted_at):
+    # The searched cells change before the interruption and after it, at step 10 as the first thing.
+    config, architecture = training_config(steps=12, refresh_cells_every=5), avatar_config(condition=condition)
+
+    def fresh():
+        torch.manual_seed(0)
+        return Trainer(new_avatar(store, architecture), store, config, 0, CPU)
+
+    whole = fresh()
     for _ in range(12):
         whole.advance()
-    first = trainer_for(store, **changes)
-    for _ in range(7):
+    first = fresh()
+    for _ in range(interrupted_at):
         first.advance()
     torch.save(first.state(), tmp_path / "checkpoint.pt")
+    second = fresh()
     torch.manual_seed(99)
-    second = Trainer(new_avatar(store), store, training_config(**changes), 0, CPU)
     second.restore(load_checkpoint(tmp_path / "checkpoint.pt", CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint"), "here")
-    assert second.step == 7
-    for _ in range(5):
+    assert second.step == interrupted_at
+    for _ in range(12 - interrupted_at):
         second.advance()
     for mine, theirs in zip(second.parameters + second.average, whole.parameters + whole.average, strict=True):
         assert torch.equal(mine, theirs)

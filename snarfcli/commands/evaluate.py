@@ -18,6 +18,7 @@ from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import evaluate
 from snarfcli.evaluation.report import SPLITS, Evaluation, metrics_content, table, timings_text
+from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.files import write_json
 from snarfcli.models.avatar import Avatar
 from snarfcli.models.start_bones import with_start_bones
@@ -54,6 +55,10 @@ class EvalConfig:
     """Evaluate so many frames, evenly spaced; null for all."""
     points: int | None = MISSING
     """Evaluate so many points a frame, half uniform, half near the surface; null for all."""
+    surface_frames: int = MISSING
+    """In so many frames the surface is extracted and compared with the true one (Chamfer, normals, F-score); 0: none."""
+    surface_resolution: int = MISSING
+    """Voxels along the longest side of those surfaces."""
     figure: bool = MISSING
     """Whether to draw the worst and the best frames."""
     figure_frames: int = MISSING
@@ -122,8 +127,13 @@ def run(config: EvalConfig) -> None:
         samples=store.manifest["settings"],
     )
     log.info("\n%s\n\n%s", table(evaluation), timings_text(evaluation))
+    surfaces = None
+    if config.surface_frames:
+        surfaces = measure_surfaces(avatar, sequences, config.surface_frames, config.surface_resolution)
+        log.info("%s", surfaces_text(surfaces))
     (folder / "frames.png").unlink(missing_ok=True)  # an older figure would not belong to these numbers
-    write_json(folder / "metrics.json", metrics_content(evaluation, {**asdict(config), "avatar": str(path)}))
+    content = metrics_content(evaluation, {**asdict(config), "avatar": str(path)})
+    write_json(folder / "metrics.json", {**content, "surfaces": surfaces})
     log.info("metrics: %s", folder / "metrics.json")
     if config.figure:
         from snarfcli.evaluation.figure import write_figure
@@ -143,8 +153,12 @@ def run(config: EvalConfig) -> None:
 def _check(config: EvalConfig) -> None:
     """Refuse settings that cannot be used, before any work starts."""
     check_choice("split", config.split, SPLITS)
-    for name, least in (("max_frames", 1), ("points", 2), ("figure_frames", 1), ("figure_resolution", 16), ("seed", 0)):
-        check_number(name, getattr(config, name), least)
+    least = {
+        "max_frames": 1, "points": 2, "surface_frames": 0, "surface_resolution": 16, "figure_frames": 1,
+        "figure_resolution": 16, "seed": 0,
+    }  # fmt: skip
+    for name, value in least.items():
+        check_number(name, getattr(config, name), value)
     if config.search is not None:
         check_search(config.search)
     samples = samples_folder(config.data_root, config.data.name, config.subject)

@@ -52,6 +52,8 @@ def config(store: SampleStore, tmp_path: Path, caplog: pytest.LogCaptureFixture)
         max_frames=None,
         points=None,
         figure=False,
+        surface_frames=0,
+        surface_resolution=32,
         figure_frames=1,
         figure_resolution=24,
         device="cpu",
@@ -249,3 +251,16 @@ def test_the_yaml_fits_the_settings():
     assert isinstance(plain, EvalConfig)
     assert (plain.search, plain.run, plain.split, plain.data.name) == (None, "fast_snarf", "id", "builtin")
     assert (other.search.name, other.search.init_bones, other.split) == ("broyden", [0, 1], "ood")
+
+
+def test_surfaces_are_compared(config, store, caplog):
+    run(replace(config, surface_frames=2, surface_resolution=48))
+    surfaces = read(folder_of(config) / "eval_id")["surfaces"]
+    assert surfaces["frames"] == 2 and surfaces["frames_without_surface"] == 0 and surfaces["resolution"] == 48
+    # half of the capsule is missing, and the other half is 3 cm too thin
+    assert 0.03 < surfaces["chamfer_m"] < 0.3 and surfaces["f_score"] == 0 and 0.5 < surfaces["normal_consistency"] < 1
+    assert "surfaces of 2 frames at resolution 48: Chamfer distance" in caplog.text
+    run(config)
+    assert read(folder_of(config) / "eval_id")["surfaces"] is None
+    with pytest.raises(UserError, match="surface_frames must be at least 0, got -1"):
+        run(replace(config, surface_frames=-1))

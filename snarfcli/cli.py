@@ -120,6 +120,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"snarf {command.name}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
+    except BrokenPipeError:  # whoever read the output has seen enough, as in "| head"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except Exception as error:
         return _report(command, error)
 
@@ -309,17 +312,17 @@ def _help(command: Command) -> str:
     schema = getattr(module, command.schema)
     lines = [f"snarf {command.name}: {command.summary}", "", f"example: {command.example}", ""]
     flags = command.flags | {"--cfg job": "print the configuration and stop", "-m": "a run for each of comma-separated values"}
-    lines += ["flags:"] + [f"  {flag:<22}{meaning}" for flag, meaning in flags.items()] + [""]
+    lines += ["flags:"] + [f"  {flag:<21} {meaning}" for flag, meaning in flags.items()] + [""]
     groups = [group for group in group_schemas(schema) if group_options(group)]
     if groups:
         lines += ["choices (GROUP=OPTION):"]
         for group in groups:
-            lines.append(f"  {group:<22}{', '.join(group_options(group))}")
+            lines.append(f"  {group:<21} {', '.join(group_options(group))}")
         lines.append("")
     lines += ["settings (NAME=VALUE):"]
     for name, text in describe(schema):
-        lines.append(f"  {name:<22}{text}")
+        lines.append(f"  {name:<21} {text}")
     for group, node in group_schemas(schema).items():
         lines += ["", f"settings of {group} ({group}.NAME=VALUE):"]
-        lines += [f"  {name:<22}{text}" for name, text in describe(node)]
+        lines += [f"  {name:<21} {text}" for name, text in describe(node)]
     return "\n".join(lines)

@@ -14,7 +14,7 @@ from snarfcli.models.avatar import Avatar
 from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
 from snarfcli.sampling import SamplingSettings
 from snarfcli.shape import ConditionConfig, ShapeConfig
-from snarfcli.training.extent import rough_canonical_surface
+from snarfcli.training.extent import rough_canonical_points
 from snarfcli.training.settings import TrainingConfig
 
 
@@ -54,6 +54,6 @@ def training_config(**changes: object) -> TrainingConfig:
 def new_avatar(store: SampleStore, config: AvatarConfig | None = None) -> Avatar:
     """Return an untrained avatar of the store's subject."""
     config = config or avatar_config()
-    surface = rough_canonical_surface(store)
+    surface = rough_canonical_points(store)
     grid = CanonicalGrid.around(surface, config.skinning.margin_m)
     return Avatar(config, store.skeleton, grid, surface, {"data": "builtin", "subject": "toy"})

@@ -27,7 +27,7 @@ from snarfcli.models.start_bones import with_start_bones
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.shape import CONDITIONS, ConditionConfig, ShapeConfig
-from snarfcli.training.extent import rough_canonical_surface
+from snarfcli.training.extent import rough_canonical_points
 from snarfcli.training.loop import train
 from snarfcli.training.losses import JOINT_TARGETS
 from snarfcli.training.settings import TrainingConfig
@@ -172,7 +172,7 @@ def _check(config: TrainConfig) -> None:
 def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -> Trainer:
     """Return a fresh avatar of the store's subject in the hands of a trainer."""
     search = with_start_bones(config.search, store.skeleton)
-    surface = rough_canonical_surface(store)
+    surface = rough_canonical_points(store)
     skinning = with_grid_sides(config.skinning, surface, store.skeleton)
     grid = CanonicalGrid.around(surface, skinning.margin_m)
     field = None

@@ -288,6 +288,8 @@ def _report(manifest: Mapping[str, Any], frames: int, points_per_frame: int, sec
         manifest["subject"], manifest["data"], counts["train"], counts["test"], counts["ood"],
         manifest["bytes"] / 1e6, manifest["bytes"] / max(1, all_frames),
     )  # fmt: skip
+    if counts["train"] and not counts["test"] and not counts["ood"]:
+        log.warning("warning: no sequence is held out, so nothing can be evaluated; name some with data.test=[NAME]")
     if all(entry["boundary_edges"] == 0 for entry in manifest["sequences"]):
         log.info(
             "self-intersecting: winding number and ray parity label %.3f %% of the points differently",

@@ -234,7 +234,8 @@ class SampleStore:
         command = f'run "snarf preprocess data={data} subject={subject}{elsewhere}"'
         if not (folder / "manifest.json").exists():
             if any(folder.glob("*/*/sequence.json")):
-                raise UserError(f"the samples of subject {subject} under {folder} are unfinished; {command} to resume")
+                begun = f"the samples of subject {subject} under {folder} are unfinished"
+                raise UserError(f"{begun}; {command}, with the settings it began with, to go on")
             raise UserError(f"no samples of subject {subject} under {folder.parent}; {command}")
         manifest = read_json(folder / "manifest.json", "manifest of the samples")
         check_format(manifest, folder)

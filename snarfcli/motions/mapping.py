@@ -117,7 +117,7 @@ def _overrule(
         target = targets.find(target_name)
         if target is None:
             raise UserError(
-                f"{where}: the skeleton has no joint {target_name!r:.60}{nearest(target_name, skeleton.names)}"
+                f"{where}: the skeleton has no joint {target_name!r:.60}{nearest(target_name, skeleton.names) or '.'}"
                 f" It has {_listed(skeleton.names)}"
             )
         if source_name is None:
@@ -126,7 +126,7 @@ def _overrule(
         source = sources.find(source_name)
         if source is None:
             raise UserError(
-                f"{where}: {path} has no joint {source_name!r:.60}{nearest(source_name, rig.names)}"
+                f"{where}: {path} has no joint {source_name!r:.60}{nearest(source_name, rig.names) or '.'}"
                 f" It has {_listed(rig.names)}"
             )
         pairs[target] = source

@@ -10,17 +10,18 @@ from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
 from snarfcli.models.extent import unpose_by_nearest_bone
 
-__all__ = ["rough_canonical_surface"]
+__all__ = ["rough_canonical_points"]
 
 _FRAMES = 8
-_POINTS = 1024
+_POINTS = 1024  # of the surface, and as many inside
 
 
-def rough_canonical_surface(store: SampleStore) -> Tensor:
-    """Return surface points [K, 3] in the canonical frame, metres, right to a few centimetres, and the joints.
+def rough_canonical_points(store: SampleStore) -> Tensor:
+    """Return points of the body [K, 3] in the canonical frame, metres, right to a few centimetres, and the joints.
 
-    No template and no skinning weights are used: the training frames nearest to the canonical pose are taken back rigidly,
-    bone by bone. The first and last points along each axis are kept, the others thinned out.
+    No template and no skinning weights are used: in the training frames nearest to the canonical pose the mesh's vertices, and
+    the samples inside it, are taken back rigidly, bone by bone. Vertices alone would leave out the middle of a large part
+    with few of them. The first and last points along each axis are kept, the others thinned out.
 
     Raises:
         UserError: the samples hold no training frames.
@@ -31,13 +32,16 @@ def rough_canonical_surface(store: SampleStore) -> Tensor:
         raise UserError('the samples hold no training frames; run "snarf preprocess" with the training sequences')
     poses = np.stack([sequence.poses[frame] for sequence, frame in frames])
     distance = np.abs(poses[:, 1:] - skeleton.canonical_pose.numpy()[None, 1:]).sum((1, 2))
-    parts = []
+    surface, inside = [], []
     for index in np.argsort(distance, kind="stable")[:_FRAMES]:
         sequence, frame = frames[index]
         vertices = torch.as_tensor(np.array(sequence.vertices(frame)), dtype=torch.float32)
         transforms = torch.as_tensor(np.array(sequence.bone_transforms[frame]), dtype=torch.float32)
-        parts.append(unpose_by_nearest_bone(vertices, transforms, skeleton))
-    points = torch.cat(parts)
-    thinned = points[:: max(1, len(points) // _POINTS)]
+        surface.append(unpose_by_nearest_bone(vertices, transforms, skeleton))
+        uniform = np.arange(sequence.num_uniform)
+        samples = torch.as_tensor(sequence.points(frame, uniform)[sequence.occupancies(frame, uniform)])
+        inside.append(unpose_by_nearest_bone(samples, transforms, skeleton))
+    thinned = [part[:: max(1, len(part) // _POINTS)] for part in (torch.cat(surface), torch.cat(inside))]
+    points = torch.cat([*surface, *inside])
     outermost = points[torch.cat([points.argmin(0), points.argmax(0)])]
-    return torch.cat([thinned, outermost, skeleton.canonical_joints])
+    return torch.cat([*thinned, outermost, skeleton.canonical_joints])

@@ -191,7 +191,8 @@ def test_missing_and_unfinished_samples_name_the_command(folder: Path, tmp_path:
     with pytest.raises(UserError, match=r'no samples of subject 50002 under .*builtin; run "snarf preprocess'):
         SampleStore.open(tmp_path, "builtin", "50002")
     (folder / "manifest.json").unlink()
-    with pytest.raises(UserError, match=r'unfinished; run "snarf preprocess data=builtin subject=toy data_root=.*", with the settings it began with'):
+    begun = r'unfinished; run "snarf preprocess data=builtin subject=toy data_root=.*", with the settings it began with'
+    with pytest.raises(UserError, match=begun):
         _open(folder)
 
 

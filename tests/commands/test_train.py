@@ -37,6 +37,7 @@ def config(store: SampleStore, tmp_path: Path, caplog: pytest.LogCaptureFixture)
         skinning=parts.skinning,
         search=parts.search,
         shape=parts.shape,
+        condition=parts.condition,
         training=training_config(steps=6, validate_every=3, checkpoint_every=4, bootstrap_steps=3),
         data_root=str(store.folder.parents[2]),
         output_root=str(tmp_path / "outputs"),

@@ -48,8 +48,9 @@ def config_for(store, tmp_path, caplog):
         steps = {"steps": 6, "refresh_cells_every": 2, "validate_every": 6, "checkpoint_every": 4, "bootstrap_steps": 3}
         return TrainConfig(
             subject="toy", data=DataConfig("builtin", 1, 1, 1), model=parts.model, skinning=skinning, search=search,
-            shape=parts.shape, training=training_config(**(steps | training)), data_root=str(store.folder.parents[2]),
-            output_root=str(tmp_path / "outputs"), run=name, resume=False, overwrite=False, device="cpu", threads=None, seed=0,
+            shape=parts.shape, condition=parts.condition, training=training_config(**(steps | training)),
+            data_root=str(store.folder.parents[2]), output_root=str(tmp_path / "outputs"), run=name,
+            resume=False, overwrite=False, device="cpu", threads=None, seed=0,
         )  # fmt: skip
 
     return make
@@ -59,8 +60,7 @@ def eval_config(config: TrainConfig, search: SearchConfig | None = None) -> Eval
     return EvalConfig(
         subject="toy", data=config.data, search=search, data_root=config.data_root, output_root=config.output_root,
         run=config.run, split="id", ckpt=None, max_frames=2, points=None, figure=False, figure_frames=1,
-        surface_frames=0, surface_resolution=32,
-        figure_resolution=24, device="cpu", threads=None, seed=0,
+        surface_frames=0, surface_resolution=32, figure_resolution=24, device="cpu", threads=None, seed=0,
     )  # fmt: skip
 
 

@@ -100,15 +100,21 @@ def test_points_lie_as_the_stored_ones_do(store) -> None:
 class _GrowingMeshes:
     """Open capsules whose number of triangles changes from frame to frame."""
 
-    def __len__(self) -> int:
-        return 12
+    def __init__(self, frames=range(12)) -> None:
+        self.frames = list(frames)
 
-    def __getitem__(self, frame: int):
-        vertices, faces = capsule_mesh(0.5, 0.1, around=12 + 2 * (int(frame) // 4))
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int):
+        vertices, faces = capsule_mesh(0.5, 0.1, around=12 + 2 * (int(self.frames[index]) // 4))
         return vertices, np.delete(faces, [10, 11], axis=0)
 
     def chosen(self, frames):
-        return [self[frame] for frame in frames]
+        return _GrowingMeshes([self.frames[frame] for frame in frames])
+
+    def source(self, index: int) -> str:
+        return ""
 
     def fingerprint(self) -> str:
         return ""

@@ -38,7 +38,7 @@ class SkinningConfig:
     bone_radius_m: float | None = 0.22
     """Cells with a corner this near to a bone are searched at first, metres; null searches every cell, always."""
     surface_radius_m: float = 0.12
-    """So are cells this near to the rough canonical surface that the grid's box was made from, metres."""
+    """So are cells this near to the rough points of the body that the grid's box was made from, metres."""
     width: int = 128
     """Width of the network's hidden layers."""
     depth: int = 4

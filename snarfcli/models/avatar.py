@@ -36,7 +36,7 @@ class Avatar:
         config: architecture.
         skeleton: joint tree, rest joints and canonical pose.
         grid: canonical box that holds the body.
-        surface: rough canonical surface points, [K, 3], metres, for a new avatar; a saved one knows where to search.
+        surface: rough points of the body, [K, 3], canonical, metres, for a new avatar; a saved one knows where to search.
         facts: plain facts about its making (data, subject, steps, ...), saved with it.
         field: weight field of a new avatar instead of the one that `config.skinning` describes; preset weights need it.
     """

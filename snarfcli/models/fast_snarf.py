@@ -85,7 +85,7 @@ class FastSnarf(nn.Module):
         config: architecture.
         skeleton: joint tree and canonical pose.
         grid: canonical box of the skinning weights.
-        surface: rough canonical surface points, [K, 3], metres; with the bones they say where to search at first.
+        surface: rough points of the body, [K, 3], canonical, metres; with the bones they say where to search at first.
         field: weight field to use instead of the one that `config.skinning` describes; preset weights need it.
     """
 

@@ -6,35 +6,11 @@ import pickle
 
 import numpy as np
 import pytest
-import torch
+from pose_files import TWO_JOINTS, amass_arrays, save
 from scipy.spatial.transform import Rotation
 
-from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError
 from snarfcli.motions import builtin_motion, read_motion
-
-TWO_JOINTS = Skeleton(("a", "b"), (-1, 0), torch.zeros(2, 3), torch.zeros(2, 3))
-UPRIGHT_IN_Z_UP = np.array([np.pi / 2, 0, 0])  # turns the y-up rest body to stand along z
-
-
-def amass_arrays(frames=4, width=156, seed=0):
-    rng = np.random.default_rng(seed)
-    poses = 0.3 * rng.normal(size=(frames, width))
-    poses[:, :3] = UPRIGHT_IN_Z_UP + 0.1 * rng.normal(size=(frames, 3))
-    trans = rng.normal(size=(frames, 3))
-    return {
-        "poses": poses,
-        "trans": trans,
-        "mocap_framerate": np.array(120.0),
-        "gender": np.array("neutral"),
-        "betas": np.zeros(16),
-    }
-
-
-def save(tmp_path, **arrays):
-    path = tmp_path / "walk_poses.npz"
-    np.savez(path, **{key: value for key, value in arrays.items() if value is not None})
-    return path
 
 
 def test_bad_files(tmp_path):

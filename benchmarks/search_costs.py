@@ -109,7 +109,8 @@ class _Step:
         from snarfcli.cli import register_schemas
         from snarfcli.commands.train import TrainConfig
         from snarfcli.datasets.builtin import builtin_subject
-        from snarfcli.models.fast_snarf import AvatarConfig, FastSnarf
+        from snarfcli.models.fast_snarf import FastSnarf
+        from snarfcli.models.settings import AvatarConfig
         from snarfcli.settings import config_folder
 
         register_schemas("train", TrainConfig)

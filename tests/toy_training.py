@@ -11,7 +11,7 @@ from snarfcli.datasets.preprocessing import preprocess_subject
 from snarfcli.datasets.store import SampleStore
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.models.avatar import Avatar
-from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
+from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.sampling import SamplingSettings
 from snarfcli.shape import ConditionConfig, ShapeConfig
 from snarfcli.training.extent import rough_canonical_points

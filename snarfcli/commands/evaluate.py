@@ -90,19 +90,18 @@ def run(config: EvalConfig) -> None:
     avatar = Avatar.load(path, device)
     _check_match(avatar, store, config)
     if config.search is not None:
-        search = with_start_bones(config.search, avatar.skeleton)
         try:
-            avatar.model.deformer.search = search
+            avatar.model.choose_search(with_start_bones(config.search, avatar.skeleton))
         except ValueError as error:
-            raise UserError(f"{error}; leave search out, or give search=snarf") from None
-    search = avatar.model.deformer.search
+            raise UserError(f"{error}; leave search out, or give search=snarf for weights that are searched directly") from None
+    search = avatar.model.search
     folder = path.parent / _folder_name(config, avatar)
     _check_writable(folder)
     log.info(
         "data: %s, subject %s, %s: %d sequences, %d frames",
         store.data, store.subject, SPLITS[config.split], len(sequences), sum(s.num_frames for s in sequences),
     )  # fmt: skip
-    log.info("avatar: %s, search %s, on %s", path, search.name, device)
+    log.info("avatar: %s, %s, on %s", path, f"search {search.name}" if search else avatar.config.model.name, device)
 
     start = time.perf_counter()
     frames = evaluate(
@@ -123,7 +122,7 @@ def run(config: EvalConfig) -> None:
         machine=machine_facts(),
         device=str(device),
         training=avatar.facts,
-        search=asdict(search),
+        search=asdict(search) if search else {},
         samples=store.manifest["settings"],
     )
     log.info("\n%s\n\n%s", table(evaluation), timings_text(evaluation))

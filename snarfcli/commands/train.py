@@ -19,11 +19,12 @@ from snarfcli.datasets.store import SampleStore, samples_folder
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
-from snarfcli.models.avatar import Avatar, load_checkpoint
-from snarfcli.models.fast_snarf import AvatarConfig, ModelConfig
+from snarfcli.models.avatar import SYSTEMS, Avatar, load_checkpoint
 from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
+from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.start_bones import with_start_bones
+from snarfcli.models.system import MeshTemplate
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.shape import CONDITIONS, ConditionConfig, ShapeConfig
@@ -31,7 +32,7 @@ from snarfcli.training.extent import rough_canonical_points
 from snarfcli.training.loop import train
 from snarfcli.training.losses import JOINT_TARGETS
 from snarfcli.training.settings import TrainingConfig
-from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Trainer
+from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Diverged, Trainer
 
 __all__ = ["TrainConfig", "new_trainer", "run"]
 
@@ -132,6 +133,10 @@ def run(config: TrainConfig) -> None:
         except KeyboardInterrupt:
             log.info("stopped at step %d; continue with resume=true", trainer.step)
             raise
+        except Diverged as error:
+            facts = {"status": "diverged", "reason": str(error), "steps": trainer.step, "checkpoint": checkpoint.exists()}
+            write_json(folder / "metrics.json", _facts(config) | facts | machine_facts())
+            raise
     finished = trainer.finished_avatar()
     finished.facts |= {"steps": trainer.step, "validation": result["validation"]}
     finished.save(folder / "avatar.pt")
@@ -164,6 +169,7 @@ def _check(config: TrainConfig) -> None:
     check_choice("condition.name", config.condition.name, CONDITIONS)
     for name in ("width", "depth"):
         check_number(f"shape.{name}", getattr(config.shape, name), 1)
+    check_choice("model.name", config.model.name, SYSTEMS)
     check_skinning(config.skinning, config.search)
     check_search(config.search)
     check_number("seed", config.seed, 0)
@@ -171,6 +177,7 @@ def _check(config: TrainConfig) -> None:
 
 def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -> Trainer:
     """Return a fresh avatar of the store's subject in the hands of a trainer."""
+    template = _template(config.model.name, store)
     search = with_start_bones(config.search, store.skeleton)
     surface = rough_canonical_points(store)
     skinning = with_grid_sides(config.skinning, surface, store.skeleton)
@@ -186,8 +193,26 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
         surface,
         {"data": store.data, "subject": store.subject, "seed": config.seed, "training": config.training.name},
         field,
+        template,
     )
     return Trainer(avatar, store, config.training, config.seed, device)
+
+
+def _template(model: str, store: SampleStore) -> MeshTemplate | None:
+    """Return the subject's mesh with its true skinning weights for a system that is told them, else None.
+
+    Raises:
+        UserError: the samples hold none.
+    """
+    if not SYSTEMS[model].needs_template:
+        return None
+    if store.template is None:
+        raise UserError(
+            f"model={model} needs the subject's mesh with its true skinning weights, which the samples of {store.data} "
+            f"{store.subject} do not hold; choose another model, or data made with a body model or a rig"
+        )
+    parts = (store.template.vertices, store.template.weights)
+    return MeshTemplate(*(torch.as_tensor(part, dtype=torch.float32) for part in parts))
 
 
 def _write_config(folder: Path, config: TrainConfig) -> None:
@@ -201,18 +226,26 @@ def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seco
     validation = result["validation"]
     held_back = sum(len(sequence.val_frames) for sequence in trainer.store.sequences("train"))
     return {
-        "data": config.data.name,
-        "subject": config.subject,
-        "model": config.model.name,
+        **_facts(config),
+        "status": "trained",
         "split": "validation",
         "iou_bbox": validation.get("iou_bbox"),
         "iou_surface": validation.get("iou_surface"),
         "frames": min(config.training.validation_frames, held_back),
         "steps": trainer.step,
-        "seed": config.seed,
         "timings": {"wall_s": round(seconds, 2)} | {k: v for k, v in result.items() if k != "validation"},
-        "training": asdict(config.training),
         **machine_facts(),
+    }
+
+
+def _facts(config: TrainConfig) -> dict[str, Any]:
+    """Return what `metrics.json` says however the run ends."""
+    return {
+        "data": config.data.name,
+        "subject": config.subject,
+        "model": config.model.name,
+        "seed": config.seed,
+        "training": asdict(config.training),
     }
 
 

@@ -49,6 +49,12 @@ class Correspondences:
         mask[self.query] = True
         return mask[:-1].reshape(self.batch, self.count)
 
+    @property
+    def counts(self) -> Tensor:
+        """How many correspondences each query has, [B, N]."""
+        counts = self.query.new_zeros(self.batch * self.count + 1)
+        return counts.index_add(0, self.query, torch.ones_like(self.query))[:-1].reshape(self.batch, self.count)
+
     def padded(self) -> tuple[Tensor, Tensor]:
         """Return the roots as [B, N, I, 3] and a mask [B, N, I], I the most roots of any query, at least 1."""
         total = self.batch * self.count

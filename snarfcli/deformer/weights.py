@@ -43,11 +43,11 @@ class BonePrior(nn.Module):
         self.register_buffer("segments", segments.clone())
         self.register_buffer("owner", torch.tensor(list(owner)))
 
-    def forward(self, canonical: Tensor) -> Tensor:
-        """Return logits [N, J] at canonical points [N, 3], metres."""
-        distances = segment_distances(canonical, self.segments)
-        owner = self.owner.expand(len(canonical), -1)
-        start = distances.new_full((len(canonical), self.num_bones), torch.inf)
+    def forward(self, points: Tensor, segments: Tensor | None = None) -> Tensor:
+        """Return logits [N, J] at points [N, 3], metres, of the canonical frame, or of the frame of `segments` [S, 2, 3]."""
+        distances = segment_distances(points, self.segments if segments is None else segments)
+        owner = self.owner.expand(len(points), -1)
+        start = distances.new_full((len(points), self.num_bones), torch.inf)
         return start.scatter_reduce(1, owner, distances, "amin") / -self.falloff
 
 

@@ -16,17 +16,35 @@ from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid, PresetWeights
 from snarfcli.errors import UserError
 from snarfcli.files import write_tensors
-from snarfcli.models.fast_snarf import NO_CORRESPONDENCE, AvatarConfig, FastSnarf, FieldSamples
+from snarfcli.models.back_d import BackD
+from snarfcli.models.back_lbs import BackLBS
+from snarfcli.models.fast_snarf import FastSnarf
+from snarfcli.models.nasa import Nasa
+from snarfcli.models.piecewise import Piecewise
+from snarfcli.models.pose_onet import PoseONet
+from snarfcli.models.settings import AvatarConfig
+from snarfcli.models.smpl_nn import SmplNN
+from snarfcli.models.snarf import Snarf
+from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, MeshTemplate, System
 
 if TYPE_CHECKING:
     from snarfcli.meshing.mesh import Mesh
 
-__all__ = ["Avatar", "load_checkpoint"]
+__all__ = ["SYSTEMS", "Avatar", "load_checkpoint"]
 
 FORMAT = "snarf-avatar"
 FORMAT_VERSION = 1
-_MODELS = {"fast_snarf": FastSnarf}
-_SURFACE_MOVES_M = 0.06  # how far the pose may move the canonical surface
+SYSTEMS: dict[str, type[System]] = {
+    "fast_snarf": FastSnarf,
+    "snarf": Snarf,
+    "pose_onet": PoseONet,
+    "back_lbs": BackLBS,
+    "back_d": BackD,
+    "nasa": Nasa,
+    "piecewise": Piecewise,
+    "smpl_nn": SmplNN,
+}
+"""The systems by the names that `model` gives them."""
 
 
 class Avatar:
@@ -39,6 +57,7 @@ class Avatar:
         surface: rough points of the body, [K, 3], canonical, metres, for a new avatar; a saved one knows where to search.
         facts: plain facts about its making (data, subject, steps, ...), saved with it.
         field: weight field of a new avatar instead of the one that `config.skinning` describes; preset weights need it.
+        template: the subject's mesh with its skinning weights, for the systems that are told them.
     """
 
     def __init__(
@@ -49,15 +68,18 @@ class Avatar:
         surface: Tensor | None = None,
         facts: dict[str, Any] | None = None,
         field: Callable[[Tensor], Tensor] | None = None,
+        template: MeshTemplate | None = None,
     ) -> None:
-        if config.model.name not in _MODELS:
-            raise ValueError(f"model.name must be one of {', '.join(_MODELS)}, got {config.model.name!r}")
+        if config.model.name not in SYSTEMS:
+            raise ValueError(f"model.name must be one of {', '.join(SYSTEMS)}, got {config.model.name!r}")
         self.config = config
         self.skeleton = skeleton
         self.facts = dict(facts or {})
         surface = skeleton.canonical_joints if surface is None else surface
-        self.model = _MODELS[config.model.name](config, skeleton, grid, surface, field)
-        self._body_cells: Tensor | None = None
+        system = SYSTEMS[config.model.name]
+        self.template = template if system.keeps_template else None
+        options = {} if field is None else {"field": field}
+        self.model = system(config, skeleton, grid, surface, template, **options)
 
     # ---------------------------------------------------------------- files
     def save(self, path: str | Path) -> None:
@@ -71,7 +93,8 @@ class Avatar:
             "version": FORMAT_VERSION,
             "config": asdict(self.config),
             "skeleton": self.skeleton.to_dict(),
-            "grid": {"lower": self.model.deformer.lower.cpu(), "upper": self.model.deformer.upper.cpu()},
+            "grid": {"lower": self.model.grid.lower.cpu(), "upper": self.model.grid.upper.cpu()},
+            "template": None if self.template is None else {name: t.cpu() for name, t in vars(self.template).items()},
             "state": {name: value.detach().cpu().clone() for name, value in self.model.state_dict().items()},
             "facts": self.facts,
         }
@@ -93,10 +116,12 @@ class Avatar:
             config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"]))
             grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
             skeleton = Skeleton.from_dict(content["skeleton"])
+            template = content.get("template")
+            template = None if template is None else MeshTemplate(template["vertices"], template["weights"])
             field = None
-            if config.skinning.name == "preset":
+            if config.skinning.name == "preset" and config.model.name == "fast_snarf":
                 field = PresetWeights.placeholder(grid, tuple(config.skinning.resolution[::-1]), skeleton.num_joints)
-            avatar = cls(config, skeleton, grid, facts=content["facts"], field=field)
+            avatar = cls(config, skeleton, grid, facts=content["facts"], field=field, template=template)
             avatar.model.load_state_dict(content["state"])
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OmegaConfBaseException) as error:
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
@@ -105,19 +130,15 @@ class Avatar:
         return avatar
 
     def to(self, device: str | torch.device) -> Avatar:
-        """Move the avatar to a device and freeze its skinning weights there.
-
-        The frozen grid of weights that are searched directly (skinning.name "mlp") serves for `posed_box` alone.
-        """
-        self.model.to(device).eval()
-        self.model.deformer.freeze()
-        self._body_cells = None
+        """Move the avatar to a device and freeze there what does not depend on the pose."""
+        self.model.to(device)
+        self.model.freeze()
         return self
 
     @property
     def device(self) -> torch.device:
         """Where the avatar computes."""
-        return self.model.deformer.lower.device
+        return self.model.grid.lower.device
 
     # ---------------------------------------------------------------- the field
     def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
@@ -149,42 +170,36 @@ class Avatar:
         """Return occupancy logits [N] at canonical points [N, 3] for the shape of one pose [J, 3].
 
         Where the search never looks the network was never trained; there it is `NO_CORRESPONDENCE`.
+
+        Raises:
+            ValueError: the system has no canonical shape.
         """
+        if not self.model.has_canonical_shape:
+            raise ValueError(f"model {self.config.model.name} has no canonical shape")
         canonical = canonical.to(self.device)
-        searched = self.model.deformer.is_active(canonical).nonzero()[:, 0]
+        searched = self.model.is_searched(canonical).nonzero()[:, 0]
         condition = self.model.condition(pose[None].to(self.device))
         values = self.model.canonical_logits(canonical[searched], condition, torch.zeros_like(searched))
         return canonical.new_full((len(canonical),), NO_CORRESPONDENCE).index_copy(0, searched, values)
 
     @torch.no_grad()
     def skinning_weights(self, canonical: Tensor) -> Tensor:
-        """Return the skinning weights [N, J] at canonical points [N, 3]."""
-        return self.model.deformer.skinning_weights(canonical.to(self.device))
+        """Return the skinning weights [N, J] at canonical points [N, 3]; ValueError where the system has none."""
+        return self.model.skinning_weights(canonical.to(self.device))
 
     @torch.no_grad()
     def skin(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
-        """Move canonical points [N, 3] into one pose, given by bone transforms [J, 4, 4]."""
-        return self.model.deformer.skin(canonical.to(self.device), bone_transforms.to(self.device))
+        """Move canonical points [N, 3] into one pose, given by bone transforms [J, 4, 4]; ValueError without weights."""
+        return self.model.skin(canonical.to(self.device), bone_transforms.to(self.device))
 
     def canonical_box(self) -> tuple[Tensor, Tensor]:
         """Return the corners (lower [3], upper [3]) of the canonical box that holds the body, metres."""
-        return self.model.deformer.lower.cpu(), self.model.deformer.upper.cpu()
+        return self.model.grid.lower.cpu(), self.model.grid.upper.cpu()
 
     @torch.no_grad()
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the corners (lower [3], upper [3]) of a box that holds the whole body in one pose [J, 4, 4], metres.
-
-        It bounds the images of all cells within 6 cm of the canonical shape.
-        """
-        if self._body_cells is None:
-            self._body_cells = self._cells_of_body()
-        return self.model.deformer.posed_box(bone_transforms.to(self.device), self._body_cells)
-
-    def _cells_of_body(self) -> Tensor:
-        """Return which grid cells the canonical shape touches in the canonical pose, or nearly, bool [D-1, H-1, W-1]."""
-        pose = self.skeleton.canonical_pose[None].float().to(self.device)
-        touched = self.model.occupied_cells(pose, reach_m=_SURFACE_MOVES_M)
-        return touched if bool(touched.any()) else self.model.deformer.active_cells
+        """Return the corners (lower [3], upper [3]) of a box that holds the whole body in one pose [J, 4, 4], metres."""
+        return self.model.posed_box(bone_transforms.to(self.device))
 
     def mesh(
         self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field"
@@ -199,7 +214,7 @@ class Avatar:
                 linear blend skinning, with its weights).
 
         Raises:
-            ValueError: `surface` is neither, or the field has no surface in this pose.
+            ValueError: `surface` is neither, the system cannot skin a surface, or the field has none in this pose.
         """
         from snarfcli.meshing.surfaces import field_surface, skinned_surface
 

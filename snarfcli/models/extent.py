@@ -7,7 +7,7 @@ from torch import Tensor
 
 from snarfcli.bodies import Skeleton
 
-__all__ = ["bone_segments", "unpose_by_nearest_bone", "weight_segments"]
+__all__ = ["bone_owners", "bone_segments", "unpose_by_nearest_bone", "weight_segments"]
 
 
 def bone_segments(skeleton: Skeleton, joints: Tensor | None = None) -> Tensor:
@@ -18,6 +18,11 @@ def bone_segments(skeleton: Skeleton, joints: Tensor | None = None) -> Tensor:
     joints = skeleton.canonical_joints if joints is None else joints
     alone = [(joint, joint) for joint in _leaves(skeleton) if skeleton.parents[joint] < 0]
     return torch.stack([torch.stack([joints[parent], joints[child]]) for parent, child in skeleton.bones + alone])
+
+
+def bone_owners(skeleton: Skeleton) -> list[int]:
+    """Return the joint that each of the segments of `bone_segments` moves with: the parent."""
+    return [parent for parent, _ in skeleton.bones] + [leaf for leaf in _leaves(skeleton) if skeleton.parents[leaf] < 0]
 
 
 def weight_segments(skeleton: Skeleton) -> tuple[Tensor, list[int]]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from snarfcli.bodies import Skeleton
@@ -17,68 +17,26 @@ from snarfcli.deformer import (
     Correspondences,
     ForwardDeformer,
     SearchConfig,
-    SkinningConfig,
     cells_near,
 )
 from snarfcli.deformer.cells import corners_of
+from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import bone_segments, weight_segments
-from snarfcli.precision import network_precision
-from snarfcli.shape import CONDITIONS, ConditionConfig, OccupancyNetwork, ShapeConfig, joints_of_bones
+from snarfcli.models.settings import AvatarConfig, ModelConfig
+from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, MeshTemplate, System
 
-__all__ = ["AvatarConfig", "FastSnarf", "FieldSamples", "ModelConfig", "NO_CORRESPONDENCE", "blend"]
+__all__ = ["FastSnarf", "blend"]
 
-NO_CORRESPONDENCE = -30.0
-"""Logit of a point that no canonical point is moved onto: certainly outside."""
-
-_POINTS_AT_ONCE = 32_768  # canonical points in one call of the shape network; smaller calls stay in the cache
-_ROUND_NUMBER = 512  # of points in training: oneDNN compiles its matrix products anew for every size it has not met
 _SAMPLES_M = 0.04  # most distance of the samples that judge a cell; a wrist is 5 cm thick
 _KEPT_RADIUS_M = 0.1  # cells with a corner this near to a bone are searched whatever the field says
 _GROWTH_M = 0.06  # how far the cells searched in training reach beyond what might be occupied
 _GROWTH_LOGIT = -3.0  # what might be occupied in training: 5 %
 _FINAL_M = 0.04
 _FINAL_LOGIT = -2.0  # what might be occupied afterwards, in a pose not sampled: 12 %
+_SURFACE_MOVES_M = 0.06  # how far the pose may move the canonical surface
 
 
-@dataclass
-class ModelConfig:
-    name: str = "fast_snarf"
-    """Which system."""
-    blend: str = "logit"
-    """How correspondences of one point are blended in training: logit (softmax-weighted mean of the logits) or
-    probability (softmax-weighted mean of the occupancies, as in the papers)."""
-    blend_sharpness: float = 1.0
-    """Factor before the softmax of the blend (5 on occupancies in the released code)."""
-
-
-@dataclass
-class AvatarConfig:
-    """All that is needed to build an avatar's networks again."""
-
-    model: ModelConfig
-    skinning: SkinningConfig
-    search: SearchConfig
-    shape: ShapeConfig
-    condition: ConditionConfig = field(default_factory=ConditionConfig)
-
-
-@dataclass
-class FieldSamples:
-    """Values of the posed field at B x N query points."""
-
-    logits: Tensor
-    """[B, N], occupied where positive; `NO_CORRESPONDENCE` where there is none."""
-    found: Tensor
-    """Which points have a correspondence, bool [B, N]."""
-    correspondences: int
-    """Number of correspondences of all points."""
-    search_s: float
-    """Seconds spent on the correspondence search."""
-    shape_s: float
-    """Seconds spent on the shape network."""
-
-
-class FastSnarf(nn.Module):
+class FastSnarf(System):
     """Posed occupancy by correspondence search and a canonical occupancy network.
 
     Args:
@@ -86,8 +44,11 @@ class FastSnarf(nn.Module):
         skeleton: joint tree and canonical pose.
         grid: canonical box of the skinning weights.
         surface: rough points of the body, [K, 3], canonical, metres; with the bones they say where to search at first.
+        template: of no use here.
         field: weight field to use instead of the one that `config.skinning` describes; preset weights need it.
     """
+
+    has_skinning_weights: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -95,12 +56,12 @@ class FastSnarf(nn.Module):
         skeleton: Skeleton,
         grid: CanonicalGrid,
         surface: Tensor,
+        template: MeshTemplate | None = None,
         field: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(config, skeleton)
         if config.model.blend not in ("logit", "probability"):
             raise ValueError(f"model.blend must be logit or probability, got {config.model.blend!r}")
-        self.config = config
         skinning, bones, num_bones = config.skinning, bone_segments(skeleton), skeleton.num_joints
         active = kept = prior = None
         if skinning.bone_radius_m is not None:
@@ -115,15 +76,9 @@ class FastSnarf(nn.Module):
             grid, num_bones, skinning, config.search, active, prior, parents=skeleton.parents, field=field
         )
         self.register_buffer("_kept_cells", kept, persistent=False)
-        if config.condition.name not in CONDITIONS:
-            raise ValueError(f"condition.name must be one of {', '.join(CONDITIONS)}, got {config.condition.name!r}")
-        pose_size = 0 if config.condition.name == "none" else 3 * (num_bones - 1)
-        self.shape = OccupancyNetwork(config.shape, pose_size, bones)
-        self.register_buffer("_joints_of_bones", joints_of_bones(skeleton.parents), persistent=False)
-
-    def condition(self, pose: Tensor) -> Tensor:
-        """Return the pose condition [B, 3 (J - 1)]: joint angles without the global orientation, in half turns."""
-        return pose[:, 1:].flatten(1) / torch.pi
+        self.shape = self._make_shape(bones)
+        self.register_buffer("_canonical_pose", skeleton.canonical_pose.float(), persistent=False)
+        self._body_cells: Tensor | None = None
 
     def forward(
         self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
@@ -142,10 +97,10 @@ class FastSnarf(nn.Module):
         found = self.deformer(points, bone_transforms)
         after_search = time.perf_counter()
         logits = self.canonical_logits(found.canonical, self.condition(pose), found.pose, precision)
-        blended = self.training
-        combined = blend(logits, found, self.config.model) if blended else found.maximum(logits, NO_CORRESPONDENCE)
+        combined = blend(logits, found, self.config.model) if self.training else found.maximum(logits, NO_CORRESPONDENCE)
         done = time.perf_counter()
-        return FieldSamples(combined, found.found, len(found.query), after_search - start, done - after_search)
+        counts = found.counts
+        return FieldSamples(combined, counts > 0, counts, after_search - start, done - after_search)
 
     @torch.no_grad()
     def occupied_cells(
@@ -189,8 +144,10 @@ class FastSnarf(nn.Module):
 
         These are all cells within 6 cm of what is occupied, or nearly, in any of the poses [P, J, 3]; so the shape can grow in
         every direction, beyond the first region too. Cells at the bones always stay. Nothing changes if every cell is to be
-        searched (skinning.bone_radius_m is null), or while nothing is occupied.
+        searched (skinning.bone_radius_m is null), in a search that has no cells, or while nothing is occupied.
         """
+        if self.search.name != "complete":
+            return
         cells = self.occupied_cells(pose, _GROWTH_LOGIT, _GROWTH_M, precision)
         if self._kept_cells is not None and bool(cells.any()):
             self.deformer.set_active_cells(cells | self._kept_cells)
@@ -205,30 +162,60 @@ class FastSnarf(nn.Module):
         if self._kept_cells is not None and bool(cells.any()):
             self.deformer.set_active_cells(cells)
 
-    def canonical_logits(self, canonical: Tensor, condition: Tensor, pose: Tensor, precision: str = "highest") -> Tensor:
-        """Return the canonical occupancy logits [M] of points [M, 3] under `condition[pose]` ([B, C] and [M])."""
-        with network_precision(precision, canonical.device):
-            if torch.is_grad_enabled():
-                extra = -len(canonical) % _ROUND_NUMBER if canonical.device.type == "cpu" else 0
-                points = F.pad(canonical, (0, 0, 0, extra))
-                padded = self.shape(points, condition, F.pad(pose, (0, extra)), self.seen_joints(points))
-                return padded[: len(canonical)].to(canonical.dtype)
-            chunks = zip(canonical.split(_POINTS_AT_ONCE), pose.split(_POINTS_AT_ONCE), strict=True)
-            logits = [self.shape(points, condition, index, self.seen_joints(points)) for points, index in chunks]
-            return torch.cat(logits).to(canonical.dtype)
+    def canonical_weights(self, canonical: Tensor) -> Tensor:
+        return self.deformer.recent_weights(canonical)
+
+    # ---------------------------------------------------------------- training
+    def joint_weights(self, joints: Tensor, bone_transforms: Tensor, pose: Tensor) -> Tensor | None:
+        weights = self.deformer.field(joints)
+        return weights if weights.requires_grad else None  # given weights are not trained
+
+    def extra_losses(
+        self, bone_transforms: Tensor, pose: Tensor, generator: torch.Generator, precision: str = "highest"
+    ) -> dict[str, Tensor]:
+        smoothness = self.config.skinning.smoothness
+        return {"smoothness": smoothness * self.deformer.smoothness()} if smoothness > 0 else {}
 
     @torch.no_grad()
-    def seen_joints(self, canonical: Tensor) -> Tensor | None:
-        """Return how much canonical points [M, 3] see of each joint but the root, [M, J - 1], 0 to 1; None: all of each.
+    def far_points(self, count: int, bone_transforms: Tensor, generator: torch.Generator) -> Tensor:
+        """Return points drawn in the searched cells and moved as the poses do."""
+        canonical = self.deformer.random_canonical(count, generator)
+        weights = self.deformer.field(canonical)  # not those between the grid's nodes, which would take them all
+        return torch.stack([skin(canonical, weights, transforms) for transforms in bone_transforms])
 
-        A point sees the joints that bound the bones which move it. No gradient reaches the weights this way: that the shape
-        could be mended by seeing other joints is no reason for a point to follow other bones.
+    def freeze(self) -> None:
+        """Evaluate the skinning weights at the grid's nodes once and keep them.
 
-        Source: after SCANimate (Saito et al., CVPR 2021), which masks the pose by skinning weights.
+        The frozen grid of weights that are searched directly (skinning.name "mlp") serves for `posed_box` alone.
         """
-        if self.config.condition.name != "local":
-            return None
-        return self.deformer.recent_weights(canonical) @ self._joints_of_bones
+        self.eval()
+        self.deformer.freeze()
+        self._body_cells = None
+
+    # ---------------------------------------------------------------- use
+    @property
+    def grid(self) -> CanonicalGrid:
+        return self.deformer.grid
+
+    @property
+    def search(self) -> SearchConfig:
+        return self.deformer.search
+
+    def choose_search(self, search: SearchConfig) -> None:
+        self.deformer.search = search
+
+    def is_searched(self, canonical: Tensor) -> Tensor:
+        return self.deformer.is_active(canonical)
+
+    def skinning_weights(self, canonical: Tensor) -> Tensor:
+        return self.deformer.skinning_weights(canonical)
+
+    def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
+        """Return a box around the images of all cells within 6 cm of the shape in the canonical pose."""
+        if self._body_cells is None:
+            touched = self.occupied_cells(self._canonical_pose[None], reach_m=_SURFACE_MOVES_M)
+            self._body_cells = touched if bool(touched.any()) else self.deformer.active_cells
+        return self.deformer.posed_box(bone_transforms, self._body_cells)
 
 
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:

@@ -9,26 +9,30 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.nn import functional as F
 
 from snarfcli.datasets.store import SampleStore
-from snarfcli.deformer.skinning import skin
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import iou
 from snarfcli.models.avatar import Avatar
-from snarfcli.models.extent import bone_segments
+from snarfcli.models.extent import bone_owners, bone_segments
 from snarfcli.precision import PRECISIONS, matmul_precision
 from snarfcli.training.batches import Batch, load_frames, new_batches
 from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
 from snarfcli.training.settings import TrainingConfig
 
-__all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Trainer"]
+__all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Diverged", "Trainer"]
 
 CHECKPOINT_FORMAT = "snarf-checkpoint"
 CHECKPOINT_VERSION = 1
 
 _POSES_OF_A_REFRESH = 4  # training poses in which the learned shape is looked at
 _POSES_AT_THE_END = 24
+
+
+class Diverged(UserError):
+    """A loss or gradient is NaN or infinite."""
 
 
 class Trainer:
@@ -55,6 +59,7 @@ class Trainer:
         self.model.train()
         self.batches = new_batches(store, config, seed, device)
         self.bones = bone_segments(avatar.skeleton).to(device)
+        self.bone_owners = torch.tensor(bone_owners(avatar.skeleton), device=device)
         self.joints = avatar.skeleton.canonical_joints.to(device)
         self.joint_targets = joint_weight_targets(avatar.skeleton.parents, config.joint_target).to(device)
         self.parameters = [p for p in self.model.parameters() if p.requires_grad]
@@ -63,9 +68,13 @@ class Trainer:
         self.step = 0
 
     def advance(self) -> dict[str, float]:
-        """Take one step and return its losses and counts."""
+        """Take one step and return its losses and counts.
+
+        Raises:
+            Diverged: the loss, or its gradient, is not finite; the step is not taken.
+        """
         every = self.config.refresh_cells_every
-        if every and self.step and self.step % every == 0 and self.model.deformer.search.name == "complete":
+        if every and self.step and self.step % every == 0:
             generator = np.random.default_rng([self.seed, self.step, 2])
             self.model.refresh_cells(self.batches.poses(_POSES_OF_A_REFRESH, generator), self.config.precision)
         batch = self.batches.batch(self.step)
@@ -76,18 +85,15 @@ class Trainer:
         field = self.model(batch.points, batch.bone_transforms, batch.pose, self.config.precision)
         losses = {"occupancy": occupancy_loss(field.logits, batch.occupied, field.found)}
         if self.step < self.config.bootstrap_steps:
-            losses |= self._bootstrap_losses(batch.pose)
-        smoothness = self.avatar.config.skinning.smoothness
-        if smoothness > 0:
-            losses["smoothness"] = smoothness * self.model.deformer.smoothness()
+            losses |= self._bootstrap_losses(batch)
+        losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._generator(5), self.config.precision)
         total = sum(losses.values())
-        if not bool(total.isfinite()):
-            raise UserError(
-                f"the loss is {total.item()} at step {self.step}; lower training.learning_rate, now {self.config.learning_rate}"
-            )
+        self._refuse_diverged("loss", total)
         self.optimizer.zero_grad(set_to_none=True)
         with matmul_precision("medium" if self.config.precision == "bfloat16" else self.config.precision):
             total.backward()
+        gradients = [p.grad for p in self.parameters if p.grad is not None]
+        self._refuse_diverged("gradient", torch.stack(torch._foreach_norm(gradients)).sum())
         self.optimizer.step()
         self.step += 1
         self._update_average()
@@ -97,18 +103,29 @@ class Trainer:
         numbers |= {"correspondences_per_point": field.correspondences / max(batch.occupied.numel(), 1)}
         return numbers
 
+    def _refuse_diverged(self, what: str, value: Tensor) -> None:
+        """Stop before a step that would spoil the weights."""
+        if not bool(value.isfinite()):
+            raise Diverged(
+                f"diverged: the {what} is {value.item()} at step {self.step}; lower training.learning_rate, now "
+                f"{self.config.learning_rate:g}, and start again with overwrite=true"
+            )
+
+    def _generator(self, purpose: int) -> torch.Generator:
+        """Return a generator for one purpose in the coming step."""
+        seed = int(np.random.default_rng([self.seed, self.step, purpose]).integers(2**62))
+        return torch.Generator().manual_seed(seed)
+
     @torch.no_grad()
     def _with_far_points(self, batch: Batch) -> Batch:
         """Return the batch with points behind its own that lie outside the cubes of its frames, where nothing is occupied.
 
         Nobody samples there, so a piece of the shape that every frame moves out of its cube would never be noticed, as one
-        beyond the nose of an animal. Points are drawn in the searched cells and moved as the frames do; one that stays inside
-        a cube, where it has no label, goes to where no cell reaches.
+        beyond the nose of an animal. A point that stays inside a cube, where it has no label, goes to where no cell reaches.
         """
-        seed = int(np.random.default_rng([self.seed, self.step, 4]).integers(2**62))
-        canonical = self.model.deformer.random_canonical(self.config.far_points, torch.Generator().manual_seed(seed))
-        weights = self.model.deformer.field(canonical)  # not those between the grid's nodes, which would take them all
-        points = torch.stack([skin(canonical, weights, transforms) for transforms in batch.bone_transforms])
+        points = self.model.far_points(self.config.far_points, batch.bone_transforms, self._generator(4))
+        if points is None:
+            return batch
         lower, upper = batch.cube[:, None, 0], batch.cube[:, None, 1]
         is_far = ((points < lower) | (points > upper)).any(-1, keepdim=True)
         points = torch.where(is_far, points, upper + 10 * (upper - lower))
@@ -122,20 +139,20 @@ class Trainer:
         cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / max(config.steps, 1))))
         return config.learning_rate * warm * (config.final_learning_rate + (1 - config.final_learning_rate) * cosine)
 
-    def _bootstrap_losses(self, pose: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _bootstrap_losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the losses that fill the bones and tie the joints to their bones (SNARF Sec. 3.3)."""
-        losses = {}
-        if self.config.bone_occupancy_weight > 0:
-            generator = torch.Generator().manual_seed(int(np.random.default_rng([self.seed, self.step, 1]).integers(2**62)))
-            points = points_on_bones(self.bones, self.config.bone_points, generator)
-            index = torch.arange(len(points), device=self.device) % len(pose)
-            logits = self.model.canonical_logits(points, self.model.condition(pose), index, self.config.precision)
+        losses, config = {}, self.config
+        transforms, pose = batch.bone_transforms, batch.pose
+        if config.bone_occupancy_weight > 0:
+            points = points_on_bones(self.bones, config.bone_points, self._generator(1))
+            owner = self.bone_owners.repeat_interleave(config.bone_points)
+            logits = self.model.bone_logits(points, owner, transforms, pose, config.precision)
             entropy = F.binary_cross_entropy_with_logits(logits, torch.ones_like(logits))
-            losses["bone_occupancy"] = self.config.bone_occupancy_weight * entropy
-        if self.config.joint_weight > 0:
-            weights = self.model.deformer.field(self.joints)
-            if weights.requires_grad:  # given weights are not trained
-                losses["joint_weight"] = self.config.joint_weight * F.mse_loss(weights, self.joint_targets)
+            losses["bone_occupancy"] = config.bone_occupancy_weight * entropy
+        if config.joint_weight > 0:
+            weights = self.model.joint_weights(self.joints, transforms, pose)
+            if weights is not None:
+                losses["joint_weight"] = config.joint_weight * F.mse_loss(weights, self.joint_targets.expand_as(weights))
         return losses
 
     @torch.no_grad()

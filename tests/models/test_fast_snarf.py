@@ -10,7 +10,9 @@ import torch
 from snarfcli.deformer import Correspondences
 from snarfcli.errors import UserError
 from snarfcli.models.avatar import FORMAT, FORMAT_VERSION, Avatar
-from snarfcli.models.fast_snarf import NO_CORRESPONDENCE, ModelConfig, blend
+from snarfcli.models.fast_snarf import blend
+from snarfcli.models.settings import ModelConfig
+from snarfcli.models.system import NO_CORRESPONDENCE
 
 
 def correspondences(query, batch, count):

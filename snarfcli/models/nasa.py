@@ -1,0 +1,155 @@
+"""NASA: one occupancy network a bone, in the bone's own frame, and their union (Deng et al., ECCV 2020; SNARF Sec. 4.2)."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from snarfcli.bodies import Skeleton
+from snarfcli.bodies.kinematics import invert_rigid
+from snarfcli.deformer import CanonicalGrid
+from snarfcli.deformer.skinning import skin
+from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
+from snarfcli.models.settings import AvatarConfig, ModelConfig
+from snarfcli.models.system import FieldSamples, MeshTemplate
+from snarfcli.precision import network_precision
+
+__all__ = ["Nasa", "PartNetworks"]
+
+_LEAK = 0.1  # slope of the leaky ReLU for negative values (Deng et al.)
+_ON_SURFACE = 0.5  # wanted occupancy of a part at its own surface points (Deng et al.)
+_POINTS_AT_ONCE = 16_384  # each of them is evaluated once for every part
+_UNIT_M = 0.5  # lengths are divided by it before they enter a network
+
+
+class Nasa(PointwiseSystem):
+    """Parts that move rigidly with their bones and change their shape with the pose.
+
+    Each part sees a point in the frame of its bone, and a few numbers to which the pose, written as the place of the root joint
+    in the frames of all bones, is reduced for it alone. The union of the parts is the maximum over them. A loss gives each
+    surface point to the part with the largest true skinning weight; the losses of the canonical frame do not apply. With
+    `model.part_code=0` parts are rigid, which Deng et al. call NASA (R); otherwise they deform, NASA (D).
+
+    Occupancies are learned by cross-entropy, as in all systems here; the paper has squared errors.
+
+    Arguments: as `PointwiseSystem`.
+    """
+
+    needs_template: ClassVar[bool] = True
+    has_canonical_shape: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        config: AvatarConfig,
+        skeleton: Skeleton,
+        grid: CanonicalGrid,
+        surface: Tensor,
+        template: MeshTemplate | None = None,
+    ) -> None:
+        super().__init__(config, skeleton, grid, surface, template)
+        self.register_buffer("_vertices", None if template is None else template.vertices.clone(), persistent=False)
+        self.register_buffer("_vertex_weights", None if template is None else template.weights.clone(), persistent=False)
+
+    def _make_shape(self, bones: Tensor) -> nn.Module:
+        return PartNetworks(self.config.model, self.num_bones)
+
+    def forward(
+        self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+    ) -> FieldSamples:
+        start = time.perf_counter()
+        inverse, code = self._bone_frames(bone_transforms)
+        after = time.perf_counter()
+        parts = points.split(max(1, _POINTS_AT_ONCE // len(points)), 1)
+        logits = torch.cat([self._part_logits(part, inverse, code, precision).amax(1) for part in parts], 1)
+        return every_point(logits, after - start, time.perf_counter() - after)
+
+    def part_logits(self, points: Tensor, bone_transforms: Tensor, precision: str = "highest") -> Tensor:
+        """Return the logits [B, J, N] of every part at posed points [B, N, 3]."""
+        return self._part_logits(points, *self._bone_frames(bone_transforms), precision)
+
+    def _bone_frames(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what takes posed points into the frame of each bone [B, J, 4, 4], and the root joint there [B, J, 3]."""
+        inverse = invert_rigid(bone_transforms)
+        inverse = torch.cat([inverse[..., :3, :3], inverse[..., :3, 3:] - self._joints[:, :, None]], -1)
+        root = bone_transforms[:, 0, :3, :3] @ self._joints[0] + bone_transforms[:, 0, :3, 3]
+        return inverse, (inverse[..., :3] @ root[:, None, :, None])[..., 0] + inverse[..., 3]
+
+    def _part_logits(self, points: Tensor, inverse: Tensor, code: Tensor, precision: str) -> Tensor:
+        local = points[:, None] @ inverse[..., :3].transpose(-1, -2) + inverse[..., None, :, 3]
+        with network_precision(precision, points.device):
+            return self.shape(local / _UNIT_M, code / _UNIT_M).to(points.dtype)
+
+    def bone_logits(
+        self, points: Tensor, owner: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+    ) -> Tensor:
+        """Return logits where each pose moves points of the bones, [B, M]: there is no canonical shape to fill."""
+        return self(move_with_bones(points, owner, bone_transforms), bone_transforms, pose, precision).logits
+
+    def extra_losses(
+        self, bone_transforms: Tensor, pose: Tensor, generator: torch.Generator, precision: str = "highest"
+    ) -> dict[str, Tensor]:
+        """Return the loss that wants each surface point on the border of its own part and outside all others.
+
+        Source: Deng et al., the weight loss.
+        """
+        config = self.config.model
+        if config.part_weight <= 0:
+            return {}
+        chosen = torch.randint(len(self._vertices), (config.part_points,), generator=generator).to(self._vertices.device)
+        vertices, weights = self._vertices[chosen], self._vertex_weights[chosen]
+        posed = torch.stack([skin(vertices, weights, transforms) for transforms in bone_transforms])
+        wanted = _ON_SURFACE * F.one_hot(weights.argmax(1), self.num_bones).T.to(weights)
+        occupancy = self.part_logits(posed, bone_transforms, precision).sigmoid()
+        return {"parts": config.part_weight * F.mse_loss(occupancy, wanted.expand_as(occupancy))}
+
+
+class PartNetworks(nn.Module):
+    """As many small networks of equal size as there are bones, evaluated together.
+
+    Args:
+        config: their size.
+        num_bones: J.
+    """
+
+    def __init__(self, config: ModelConfig, num_bones: int) -> None:
+        super().__init__()
+        width, depth = config.part_width, config.part_depth
+        if width < 1 or depth < 1 or config.part_code < 0:
+            raise ValueError(
+                "model.part_width and part_depth must be at least 1 and part_code at least 0, "
+                f"got {width}, {depth} and {config.part_code}"
+            )
+        sizes = [3 + config.part_code] + [width] * depth + [1]
+        shapes = list(zip(sizes[:-1], sizes[1:], strict=True))
+        # as nn.Linear starts
+        self.weights = nn.ParameterList(_uniform((num_bones, a, b), a) for a, b in shapes)
+        self.biases = nn.ParameterList(_uniform((num_bones, 1, b), a) for a, b in shapes)
+        self.reduce = nn.Parameter(_uniform((num_bones, 3 * num_bones, config.part_code), 3 * num_bones))
+
+    def forward(self, local: Tensor, roots: Tensor) -> Tensor:
+        """Return the logits [B, J, N] at points [B, J, N, 3] in the frames of the bones.
+
+        Args:
+            local: the points, in half metres.
+            roots: the root joint in the frames of the bones, [B, J, 3], in half metres: the pose.
+        """
+        batch, bones, count = local.shape[:3]
+        code = torch.einsum("bp,jpc->bjc", roots.flatten(1), self.reduce)
+        first = self.weights[0]
+        # the pose's part of the first layer is the same for all points of a pose
+        h = local @ first[:, :3] + (code[:, :, None] @ first[:, 3:] + self.biases[0])
+        h = h.transpose(0, 1).reshape(bones, batch * count, -1)
+        for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+            h = torch.baddbmm(bias, F.leaky_relu(h, _LEAK), weight)
+        return h.reshape(bones, batch, count).transpose(0, 1)
+
+
+def _uniform(shape: tuple[int, ...], inputs: int) -> nn.Parameter:
+    """Return a parameter with independent entries as those of `nn.Linear` with so many inputs."""
+    bound = 1 / math.sqrt(inputs)
+    return nn.Parameter(torch.empty(shape).uniform_(-bound, bound))

@@ -1,0 +1,157 @@
+"""Systems that take each posed point back, or judge it, by itself: no search, one canonical point for each posed one."""
+
+from __future__ import annotations
+
+import time
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from snarfcli.bodies import Skeleton
+from snarfcli.deformer import CanonicalGrid
+from snarfcli.models.extent import bone_segments
+from snarfcli.models.settings import AvatarConfig
+from snarfcli.models.system import FieldSamples, MeshTemplate, System
+from snarfcli.precision import matmul_precision
+from snarfcli.segments import distance_to_segments
+
+__all__ = ["PointwiseSystem", "PosedNetwork", "every_point", "into_root_frame", "invert_blended", "move_with_bones"]
+
+_LEAST_DETERMINANT = 0.01  # of blended rotations; those of neighbouring bones bent by 150 degrees have 0.07
+_BOX_MARGIN_M = 0.06  # how far the pose may move the surface beyond where it lies in the training frames
+
+
+class PointwiseSystem(System):
+    """A system in which every posed point has exactly one place to look at.
+
+    Args:
+        config: architecture.
+        skeleton: joint tree and canonical pose.
+        grid: canonical box that holds the body.
+        surface: rough points of the body, [K, 3], canonical, metres; how far they lie from the bones bounds the posed body.
+        template: the subject's mesh, for systems that need it.
+    """
+
+    conditions: ClassVar[tuple[str, ...]] = ("global", "none")
+
+    def __init__(
+        self,
+        config: AvatarConfig,
+        skeleton: Skeleton,
+        grid: CanonicalGrid,
+        surface: Tensor,
+        template: MeshTemplate | None = None,
+    ) -> None:
+        bones = bone_segments(skeleton)
+        super().__init__(config, skeleton)
+        self.shape = self._make_shape(bones)
+        self.register_buffer("lower", grid.lower.clone())
+        self.register_buffer("upper", grid.upper.clone())
+        self.register_buffer("reach", distance_to_segments(surface, bones).max() + _BOX_MARGIN_M)
+        self.register_buffer("_joints", skeleton.canonical_joints.clone(), persistent=False)
+
+    def forward(
+        self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+    ) -> FieldSamples:
+        start = time.perf_counter()
+        with matmul_precision("highest"), torch.autocast(points.device.type, enabled=False):
+            canonical, weights = self.canonical_points(points, bone_transforms, pose)
+        after = time.perf_counter()
+        index = torch.arange(len(points), device=points.device).repeat_interleave(points.shape[1])
+        weights = None if weights is None else weights.flatten(0, 1)
+        logits = self.canonical_logits(canonical.flatten(0, 1), self.condition(pose), index, precision, weights)
+        done = time.perf_counter()
+        return every_point(logits.reshape(points.shape[:2]), after - start, done - after)
+
+    def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return where posed points [B, N, 3] come from, [B, N, 3], and by which skinning weights [B, N, J], if by any."""
+        raise NotImplementedError
+
+    @property
+    def grid(self) -> CanonicalGrid:
+        return CanonicalGrid(self.lower, self.upper, checked=True)
+
+    def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
+        """Return a box around the posed joints, as much wider as the body reaches beyond its bones."""
+        joints = move_with_bones(self._joints, torch.arange(self.num_bones), bone_transforms[None])[0]
+        return (joints.amin(0) - self.reach).cpu(), (joints.amax(0) + self.reach).cpu()
+
+
+class PosedNetwork(nn.Module):
+    """A network of a posed point and the pose, of the size of the skinning network.
+
+    The pose is joined to the point at the input. Its part of the first layer is the same for all points of a pose, so it is
+    evaluated once.
+
+    Args:
+        pose_size: length of the pose.
+        outputs: numbers for each point.
+        config: width, depth and weight norm of the layers, from `skinning`.
+        scale: lengths are divided by it, metres.
+        starts_at_zero: whether the output is zero, nearly, before training.
+    """
+
+    def __init__(self, pose_size: int, outputs: int, config: AvatarConfig, scale: float, starts_at_zero: bool) -> None:
+        super().__init__()
+        sizes = [3 + pose_size] + [config.skinning.width] * config.skinning.depth + [outputs]
+        layers = [nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+        if starts_at_zero:
+            nn.init.normal_(layers[-1].weight, 0, 1e-4)
+            nn.init.zeros_(layers[-1].bias)
+        if config.skinning.weight_norm:
+            layers = [nn.utils.parametrizations.weight_norm(layer) for layer in layers]
+        self.layers = nn.ModuleList(layers)
+        self.register_buffer("scale", torch.tensor(float(scale)))
+
+    def forward(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Return the outputs [B, N, K] at points [B, N, 3], metres, in poses [B, P]."""
+        first = self.layers[0]
+        weight = first.weight
+        h = F.linear(points / self.scale, weight[:, :3]) + F.linear(pose, weight[:, 3:], first.bias)[:, None]
+        for layer in self.layers[1:]:
+            h = layer(F.softplus(h, beta=100))
+        return h
+
+
+def every_point(logits: Tensor, search_s: float, shape_s: float) -> FieldSamples:
+    """Return samples [B, N] in which each point has one correspondence."""
+    counts = torch.ones_like(logits, dtype=torch.long)
+    return FieldSamples(logits, counts > 0, counts, search_s, shape_s)
+
+
+def into_root_frame(points: Tensor, bone_transforms: Tensor) -> Tensor:
+    """Move posed points [B, N, 3] rigidly back with the root bone, so that no system has to learn where a body stands."""
+    root = bone_transforms[:, 0]
+    return (points - root[:, None, :3, 3]) @ root[:, :3, :3]  # a rotation's inverse is its transpose
+
+
+def move_with_bones(points: Tensor, owner: Tensor, bone_transforms: Tensor) -> Tensor:
+    """Move canonical points [M, 3] rigidly with the bones `owner` [M] into every pose [B, J, 4, 4]: [B, M, 3]."""
+    moved = bone_transforms[:, owner]
+    return (moved[..., :3, :3] @ points[:, :, None])[..., 0] + moved[..., :3, 3]
+
+
+def invert_blended(points: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
+    """Move posed points back by linear blend skinning with given weights: the inverse of SNARF Eq. 4 for fixed w.
+
+    Blends of opposite rotations have no inverse; near them the determinant is kept away from zero, and points go far away
+    instead of nowhere.
+
+    Args:
+        points: [B, N, 3], posed, metres.
+        weights: [B, N, J], rows sum to 1.
+        bone_transforms: [B, J, 4, 4], canonical to posed.
+
+    Returns:
+        [B, N, 3], canonical, metres.
+    """
+    blended = (weights @ bone_transforms[:, :, :3].flatten(2)).unflatten(2, (3, 4))
+    a, b, c = blended[..., :3].unbind(-2)
+    columns = [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)]
+    determinant = (a * columns[0]).sum(-1, keepdim=True)
+    least = torch.where(determinant < 0, -_LEAST_DETERMINANT, _LEAST_DETERMINANT)
+    determinant = torch.where(determinant.abs() < _LEAST_DETERMINANT, least, determinant)
+    offset = points - blended[..., 3]
+    return sum(column * offset[..., axis, None] for axis, column in enumerate(columns)) / determinant

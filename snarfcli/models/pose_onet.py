@@ -1,0 +1,42 @@
+"""Pose-ONet: an occupancy network that is told the pose beside each point (SNARF Sec. 4.2, Fast-SNARF Sec. 5.1.2)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+from torch import Tensor, nn
+
+from snarfcli.models.pointwise import PointwiseSystem, into_root_frame, move_with_bones
+from snarfcli.shape import OccupancyNetwork
+
+__all__ = ["PoseONet"]
+
+
+class PoseONet(PointwiseSystem):
+    """The pose is joined to the posed point at the input of one network, which knows nothing of bones.
+
+    Points are taken back with the root bone, so that the network need not learn where the body stands. The network is that of
+    the canonical shape but for the place where the pose enters and the capsules, which a pose would have to move. It takes the
+    whole pose, whatever `condition` says of canonical shapes.
+
+    Arguments: as `PointwiseSystem`.
+    """
+
+    has_canonical_shape: ClassVar[bool] = False
+
+    def _make_shape(self, bones: Tensor) -> nn.Module:
+        pose_size = 3 * (self.num_bones - 1)
+        shape = replace(
+            self.config.shape, condition_layer=0, condition_size=pose_size, condition_at_start=True, prior_radius_m=None
+        )
+        return OccupancyNetwork(shape, pose_size, bones)
+
+    def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, None]:
+        return into_root_frame(points, bone_transforms), None
+
+    def bone_logits(
+        self, points: Tensor, owner: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+    ) -> Tensor:
+        """Return logits where each pose moves points of the bones, [B, M]: there is no canonical shape to fill."""
+        return self(move_with_bones(points, owner, bone_transforms), bone_transforms, pose, precision).logits

@@ -1,0 +1,42 @@
+"""What can be chosen about a system, and all that is needed to build one again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from snarfcli.deformer import SearchConfig, SkinningConfig
+from snarfcli.shape import ConditionConfig, ShapeConfig
+
+__all__ = ["AvatarConfig", "ModelConfig"]
+
+
+@dataclass
+class ModelConfig:
+    name: str = "fast_snarf"
+    """Which system: fast_snarf, snarf, pose_onet, back_lbs, back_d, nasa, piecewise or smpl_nn."""
+    blend: str = "logit"
+    """How correspondences of one point are blended in training: logit (softmax-weighted mean of the logits) or
+    probability (softmax-weighted mean of the occupancies, as in the papers); of forward skinning only."""
+    blend_sharpness: float = 1.0
+    """Factor before the softmax of the blend (5 on occupancies in the released code)."""
+    part_width: int = 40
+    """Width of the hidden layers of each part's network (nasa, piecewise)."""
+    part_depth: int = 4
+    """Number of hidden layers of each part's network."""
+    part_code: int = 4
+    """Numbers to which the pose is reduced for each part; 0 for parts that do not deform."""
+    part_weight: float = 0.5
+    """Weight of the loss that gives each surface point to one part, by the true skinning weights."""
+    part_points: int = 512
+    """Surface points for that loss in each step."""
+
+
+@dataclass
+class AvatarConfig:
+    """All that is needed to build an avatar's networks again."""
+
+    model: ModelConfig
+    skinning: SkinningConfig
+    search: SearchConfig
+    shape: ShapeConfig
+    condition: ConditionConfig = field(default_factory=ConditionConfig)

@@ -1,0 +1,68 @@
+"""SMPL NN: skinning weights of the nearest vertex of a posed base mesh (Fast-SNARF Sec. 5.2)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from snarfcli.bodies import Skeleton
+from snarfcli.deformer import CanonicalGrid
+from snarfcli.deformer.skinning import skin
+from snarfcli.models.pointwise import PointwiseSystem, invert_blended
+from snarfcli.models.settings import AvatarConfig
+from snarfcli.models.system import MeshTemplate
+from snarfcli.shape import CONDITIONS
+
+__all__ = ["SmplNN"]
+
+_PAIRS_AT_ONCE = 2**26  # distances in memory at once on a GPU
+
+
+class SmplNN(PointwiseSystem):
+    """The base mesh is moved by linear blend skinning; each query takes the weights of its nearest vertex and is moved back.
+
+    Nothing of the skinning is learned. The mesh is saved with the avatar, and its licence with it.
+
+    Arguments: as `PointwiseSystem`; the template is that base mesh.
+    """
+
+    needs_template: ClassVar[bool] = True
+    keeps_template: ClassVar[bool] = True
+    has_skinning_weights: ClassVar[bool] = True
+    conditions: ClassVar[tuple[str, ...]] = CONDITIONS
+
+    def __init__(
+        self,
+        config: AvatarConfig,
+        skeleton: Skeleton,
+        grid: CanonicalGrid,
+        surface: Tensor,
+        template: MeshTemplate | None = None,
+    ) -> None:
+        super().__init__(config, skeleton, grid, surface, template)
+        self.register_buffer("vertices", template.vertices.clone(), persistent=False)
+        self.register_buffer("vertex_weights", template.weights.clone(), persistent=False)
+
+    def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        posed = [skin(self.vertices, self.vertex_weights, transforms) for transforms in bone_transforms]
+        nearest = torch.stack([nearest_vertex(part, mesh) for part, mesh in zip(points, posed, strict=True)])
+        weights = self.vertex_weights[nearest]
+        return invert_blended(points, weights, bone_transforms), weights
+
+    def skinning_weights(self, canonical: Tensor) -> Tensor:
+        return self.vertex_weights[nearest_vertex(canonical, self.vertices)]
+
+
+@torch.no_grad()
+def nearest_vertex(points: Tensor, vertices: Tensor) -> Tensor:
+    """Return the number of the nearest of the vertices [V, 3] to each of the points [N, 3], [N]."""
+    if points.device.type == "cpu":
+        from scipy.spatial import cKDTree
+
+        finite = np.nan_to_num(points.detach().numpy(), posinf=1e6, neginf=-1e6)
+        return torch.from_numpy(cKDTree(vertices.numpy()).query(finite)[1]).long()
+    parts = points.split(max(1, _PAIRS_AT_ONCE // len(vertices)))
+    return torch.cat([torch.cdist(part, vertices).argmin(1) for part in parts])

@@ -14,7 +14,7 @@ class DataConfig:
     """Which data, and how densely it is taken."""
 
     name: str = MISSING
-    """Name of the data set: builtin, dfaust, poseprior, cape or meshes."""
+    """Name of the data set: builtin, clothed, dfaust, poseprior, cape, meshes or stick2d."""
     frame_step: int = MISSING
     """Every how many frames of a training sequence one is taken."""
     test_frame_step: int = MISSING

@@ -13,7 +13,15 @@ from snarfcli.errors import UserError, nearest
 
 __all__ = ["Request", "Source", "find_source"]
 
-_MODULES = {"builtin": "builtin", "cape": "cape", "dfaust": "dfaust", "meshes": "meshes", "poseprior": "poseprior"}
+_MODULES = {
+    "builtin": "builtin",
+    "cape": "cape",
+    "clothed": "clothed",
+    "dfaust": "dfaust",
+    "meshes": "meshes",
+    "poseprior": "poseprior",
+    "stick2d": "stick2d",
+}
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 import snarfcli
 from snarfcli.errors import UserError, nearest
-from snarfcli.settings import check_overrides, config_folder, describe, group_options, group_schemas
+from snarfcli.settings import check_overrides, config_folder, describe, group_options, group_schemas, preset_groups
 
 __all__ = ["COMMANDS", "Command", "main", "register_schemas"]
 
@@ -144,7 +144,10 @@ def _run(command: Command, arguments: list[str]) -> int:
     overrides = _translate_flags(command, arguments)
     module = importlib.import_module(f"snarfcli.commands.{command.module}")
     schema = getattr(module, command.schema)
-    check_overrides([argument for argument in overrides if not argument.startswith("-") and "=" in argument], schema)
+    settings = [argument for argument in overrides if not argument.startswith("-") and "=" in argument]
+    check_overrides(settings, schema, command.name)
+    presets = preset_groups(schema, command.name)
+    overrides = [_in_group(argument, presets) if argument in settings else argument for argument in overrides]
     register_schemas(command.name, schema)
     codes: list[int] = []
 
@@ -206,6 +209,12 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
         else:
             out.append(argument)
     return out + flags
+
+
+def _in_group(override: str, presets: dict[str, str]) -> str:
+    """Return an override such as experiment=cape as one of the group that holds the presets of the command."""
+    name, _, value = override.partition("=")
+    return f"{presets.get(name, name)}={value}"
 
 
 def _quote(value: str) -> str:
@@ -313,11 +322,11 @@ def _help(command: Command) -> str:
     lines = [f"snarf {command.name}: {command.summary}", "", f"example: {command.example}", ""]
     flags = command.flags | {"--cfg job": "print the configuration and stop", "-m": "a run for each of comma-separated values"}
     lines += ["flags:"] + [f"  {flag:<21} {meaning}" for flag, meaning in flags.items()] + [""]
-    groups = [group for group in group_schemas(schema) if group_options(group)]
-    if groups:
+    choices = {name: name for name in group_schemas(schema)} | preset_groups(schema, command.name)
+    options = {name: group_options(group) for name, group in choices.items()}
+    if any(options.values()):
         lines += ["choices (GROUP=OPTION):"]
-        for group in groups:
-            lines.append(f"  {group:<21} {', '.join(group_options(group))}")
+        lines += [f"  {name:<21} {', '.join(several)}" for name, several in options.items() if several]
         lines.append("")
     lines += ["settings (NAME=VALUE):"]
     for name, text in describe(schema):

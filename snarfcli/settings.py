@@ -13,13 +13,28 @@ from typing import Any
 
 from snarfcli.errors import UserError, nearest
 
-__all__ = ["check_overrides", "config_folder", "describe", "group_options", "group_schemas", "setting_names"]
+__all__ = [
+    "check_overrides",
+    "config_folder",
+    "describe",
+    "group_options",
+    "group_schemas",
+    "preset_groups",
+    "setting_names",
+]
 
 
 def config_folder() -> Path:
     """Return the folder with the yaml files: inside the package when installed, at the top of a checkout."""
     inside = Path(__file__).parent / "conf"
     return inside if inside.is_dir() else Path(__file__).parents[1] / "conf"
+
+
+def preset_groups(schema: type, command: str) -> dict[str, str]:
+    """Return the plain fields of a command's dataclass that name a preset, and the group of its options: a folder by the
+    command's name in one by the field's, such as experiment/train."""
+    groups = {field.name: f"{field.name}/{command}" for field in dataclasses.fields(schema)}
+    return {name: group for name, group in groups.items() if (config_folder() / group).is_dir()}
 
 
 def group_options(group: str) -> list[str]:
@@ -58,8 +73,8 @@ def setting_names(schema: type, prefix: str = "") -> list[str]:
     return names
 
 
-def check_overrides(overrides: Sequence[str], schema: type) -> None:
-    """Refuse overrides that name no setting, or no option of a choice, with the nearest valid name.
+def check_overrides(overrides: Sequence[str], schema: type, command: str = "") -> None:
+    """Refuse overrides of a command that name no setting, or no option of a choice, with the nearest valid name.
 
     Raises:
         UserError: for the first override that does not fit.
@@ -69,7 +84,7 @@ def check_overrides(overrides: Sequence[str], schema: type) -> None:
 
     parser = OverridesParser.create()
     names = setting_names(schema)
-    groups = group_schemas(schema)
+    groups = {name: name for name in group_schemas(schema)} | preset_groups(schema, command)
     hints = typing.get_type_hints(schema)
     for text in overrides:
         try:
@@ -87,7 +102,7 @@ def check_overrides(overrides: Sequence[str], schema: type) -> None:
         if group != key and type(None) in typing.get_args(hints[group]) and not is_chosen:
             raise UserError(f"{key} needs a choice of {group} with it, such as {group}={group_options(group)[0]}")
         if key in groups:
-            options = group_options(key)
+            options = group_options(groups[key])
             left_out = ", or leave it out" if type(None) in typing.get_args(hints[key]) else ""
             for value in _values(override):
                 option = "null" if value is None else str(value)

@@ -118,6 +118,8 @@ class AnimateConfig:
     """auto, cpu, cuda or cuda:N."""
     threads: int | None = MISSING
     """Threads for tensor work; null leaves PyTorch's choice."""
+    experiment: str | None = None
+    """Name of the preset of settings that the rest starts from; null for none."""
 
 
 def run(config: AnimateConfig) -> int:

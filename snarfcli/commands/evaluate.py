@@ -71,6 +71,8 @@ class EvalConfig:
     """Threads for tensor work; null leaves PyTorch's choice."""
     seed: int = MISSING
     """Seed of the choice of points."""
+    experiment: str | None = None
+    """Name of the preset of settings that the rest starts from; null for none."""
 
 
 def run(config: EvalConfig) -> None:

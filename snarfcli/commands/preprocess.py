@@ -46,6 +46,8 @@ class PreprocessConfig:
     """Names of the sequences to make; all if empty."""
     skip_broken: bool = MISSING
     """Leave out sequences that cannot be used, and list them, instead of stopping."""
+    experiment: str | None = None
+    """Name of the preset of settings that the rest starts from; null for none."""
 
 
 def run(config: PreprocessConfig) -> None:

@@ -81,6 +81,8 @@ class TrainConfig:
     """Threads for tensor work; null leaves PyTorch's choice."""
     seed: int = MISSING
     """Seed of everything random."""
+    experiment: str | None = None
+    """Name of the preset of settings that the rest starts from; null for none."""
 
 
 def run(config: TrainConfig) -> None:

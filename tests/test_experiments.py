@@ -1,0 +1,97 @@
+"""Presets of whole experiments: `experiment=` on the command line, together with the choices that a user makes."""
+
+from __future__ import annotations
+
+import importlib
+
+import pytest
+import yaml
+
+from snarfcli import cli
+from snarfcli.settings import config_folder, group_options, preset_groups
+
+
+def composed(capsys, *arguments):
+    """Return the configuration that a command would run with."""
+    code = cli.main([*arguments, "--cfg", "job"])
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    return yaml.safe_load(out)
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_none_is_chosen_by_default(capsys):
+    for command in ("preprocess", "train", "eval", "animate"):
+        assert composed(capsys, command)["experiment"] is None
+
+
+@pytest.mark.parametrize("training", ["quick", "paper"])
+@pytest.mark.parametrize("is_first", [True, False])
+def test_cape_changes_what_the_preset_of_training_says_whatever_comes_first(capsys, training, is_first):
+    choices = ["experiment=cape", f"training={training}"]
+    config = composed(capsys, "train", *(choices if is_first else choices[::-1]))
+    without = composed(capsys, "train", f"training={training}")
+    assert config.pop("experiment") == "cape" and without.pop("experiment") is None
+    changed = {key: (config["shape"].pop(key), without["shape"].pop(key)) for key in ("frequencies", "condition_layer")}
+    assert config == without  # width, depth, losses and steps are the preset's, the data the user's
+    frequencies, layer = changed["frequencies"][0], changed["condition_layer"][0]
+    assert layer == 0 and changed["condition_layer"][1] > 0
+    ratios = [b / a for a, b in zip(frequencies[:-1], frequencies[1:], strict=True)]
+    assert len(ratios) > 2 and ratios == pytest.approx([2.0] * len(ratios), rel=1e-3)
+
+
+def test_single_settings_and_other_choices_win(capsys):
+    config = composed(capsys, "train", "experiment=cape", "shape.condition_layer=2", "data=clothed", "condition=local")
+    assert (config["shape"]["condition_layer"], config["data"]["name"], config["condition"]["name"]) == (2, "clothed", "local")
+    config = composed(capsys, "train", "experiment=smoke", "training=standard", "data_root=mine")
+    assert config["training"]["name"] == "standard" and config["data_root"] == "mine"
+
+
+def test_smoke_is_one_small_folder_for_every_command(capsys):
+    configs = {name: composed(capsys, name, "experiment=smoke") for name in ("preprocess", "train", "eval", "animate")}
+    assert {config["experiment"] for config in configs.values()} == {"smoke"}
+    (root,) = {config["data_root"] for config in configs.values()}
+    assert root != composed(capsys, "train")["data_root"]  # full samples stay as they are
+    assert len({config["output_root"] for name, config in configs.items() if name != "preprocess"}) == 1
+    assert configs["train"]["training"]["name"] == "smoke" and configs["train"]["shape"]["width"] == 128
+    # 240 frames a training sequence: some must be left for training beside those for validation.
+    assert 2 <= 240 / configs["preprocess"]["data"]["frame_step"] <= 10
+
+
+def test_help_lists_them_and_every_one_says_its_name(capsys):
+    for name in ("preprocess", "train", "eval", "animate"):
+        command = cli.COMMANDS[name]
+        schema = getattr(importlib.import_module(f"snarfcli.commands.{command.module}"), command.schema)
+        assert preset_groups(schema, name) == {"experiment": f"experiment/{name}"}
+        options = group_options(f"experiment/{name}")
+        assert cli.main([name, "--help"]) == 0
+        assert f"  experiment            {', '.join(options)}\n" in capsys.readouterr().out
+        for option in options:
+            assert composed(capsys, name, f"experiment={option}")["experiment"] == option
+    assert {folder.name for folder in (config_folder() / "experiment").iterdir()} <= set(cli.COMMANDS)
+
+
+WRONG = {
+    ("train", "experiment=cap"): "there is no experiment=cap; did you mean 'cape'?; choose from cape, smoke, or leave it out",
+    ("eval", "experiment=cape"): "there is no experiment=cape; choose from smoke, or leave it out",
+    ("train", "experiment.name=cape"): "unknown setting 'experiment.name'; did you mean 'experiment",
+    ("doctor", "experiment=smoke"): "unknown setting 'experiment'",
+}
+
+
+@pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
+def test_unknown_ones_are_refused_in_one_line(capsys, arguments):
+    assert cli.main(list(arguments)) == 2
+    err = capsys.readouterr().err
+    assert WRONG[arguments] in err and len(err.strip().splitlines()) == 1
+
+
+def test_several_in_one_call(capsys):
+    assert cli.main(["train", "-m", "experiment=cape,smok", "data_root=none"]) == 2
+    assert "there is no experiment=smok; did you mean 'smoke'?" in capsys.readouterr().err
+    assert cli.main(["train", "-m", "experiment=cape,smoke", "data_root=none"]) == 2
+    assert capsys.readouterr().err.count("no samples of subject 50002 under none") == 2  # one run of each

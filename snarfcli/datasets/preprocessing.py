@@ -7,7 +7,7 @@ import logging
 import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +78,12 @@ def preprocess_subject(
     """
     broken = _report_broken(subject, sequences, skip_broken)
     chosen = _choose(subject, sequences)
+    sampling = replace(sampling, is_planar=subject.is_planar)
     settings = {
         "data": subject.data,
         "subject": subject.subject,
-        **vars(sampling),
+        # said of planar subjects only, so that the settings of others are those that their samples were made with before
+        **{name: value for name, value in vars(sampling).items() if name != "is_planar" or value},
         **{f"{split}_frame_step": step for split, step in frame_steps.items()},
     }
     folder = samples_folder(root, subject.data, subject.subject)

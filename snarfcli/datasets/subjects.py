@@ -68,6 +68,8 @@ class SubjectData:
     """What the subject was made from, such as the body's file: printed, and written to the manifest."""
     broken: tuple[tuple[str, str], ...] = ()
     """Sequences that cannot be used, and why."""
+    is_planar: bool = False
+    """Whether it is two-dimensional: its meshes are prisms along z, and only the plane z = 0 is sampled."""
 
     def of_split(self, split: Split) -> tuple[SequenceSpec, ...]:
         """Return the sequences of one split."""

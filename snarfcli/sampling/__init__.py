@@ -10,6 +10,7 @@ from snarfcli.sampling.occupancy import (
     winding_numbers,
 )
 from snarfcli.sampling.parallel import Worker, count_cores, interrupts_held_back, run_in_processes
+from snarfcli.sampling.planar import in_turned_over, outline_samples
 from snarfcli.sampling.points import (
     CUBE_PADDING,
     BrokenFrame,
@@ -41,9 +42,11 @@ __all__ = [
     "count_cores",
     "dequantise",
     "frame_generator",
+    "in_turned_over",
     "interrupts_held_back",
     "labels_differ",
     "occupancies",
+    "outline_samples",
     "pack_vertices",
     "quantise",
     "ray_parity",

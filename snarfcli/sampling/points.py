@@ -18,6 +18,7 @@ from snarfcli.sampling.occupancy import (
     ray_parity,
     winding_numbers,
 )
+from snarfcli.sampling.planar import in_turned_over, outline_samples, with_plane_on_cells
 
 __all__ = [
     "CUBE_PADDING",
@@ -64,6 +65,8 @@ class SamplingSettings:
     """`winding` or `parity`."""
     seed: int
     """Start of all random numbers."""
+    is_planar: bool = False
+    """Whether the subject is two-dimensional: a prism, sampled on the plane z = 0 alone and near its outline there."""
 
     def __post_init__(self) -> None:
         if self.points_per_frame < 8 or self.points_per_frame % 8:
@@ -281,16 +284,25 @@ def sample_frame(
     is_used[faces] = True
     surface = vertices[is_used]  # what no face uses may lie anywhere
     cube_lower, cube_size = sampling_cube(surface, settings.padding)
+    if settings.is_planar:
+        cube_lower = with_plane_on_cells(cube_lower, cube_size, _LEVELS)
     uniform = cube_lower + generator.random((count // 2, 3)) * cube_size
-    near = surface_samples(vertices, faces, count - count // 2, generator)
+    spread = outline_samples if settings.is_planar else surface_samples
+    near = spread(vertices, faces, count - count // 2, generator)
     near = near + generator.normal(scale=settings.surface_noise_m, size=near.shape)
-    cells = quantise(np.concatenate([uniform, near]), cube_lower, cube_size)
+    chosen = np.concatenate([uniform, near])
+    if settings.is_planar:
+        chosen[:, 2] = 0.0
+    cells = quantise(chosen, cube_lower, cube_size)
     points = dequantise(cells, cube_lower, cube_size)
     winding = winding_numbers(vertices, faces, points)
     by_parity = settings.inside_test == "parity"
+    occupied = ray_parity(vertices, faces, points) if by_parity else winding > 0.5
+    if settings.is_planar and not by_parity:
+        occupied |= in_turned_over(vertices, faces, points)
     return FrameSamples(
         points=cells,
-        occupied=ray_parity(vertices, faces, points) if by_parity else winding > 0.5,
+        occupied=occupied,
         vertices=pack_vertices(vertices, cube_lower, cube_size),
         faces=faces.astype(np.int32),
         cube_lower=cube_lower,

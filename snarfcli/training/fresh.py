@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from snarfcli.datasets.store import SequenceSamples
-from snarfcli.sampling import occupancies, uniform_surface_samples
+from snarfcli.sampling import in_turned_over, occupancies, outline_samples, uniform_surface_samples
 
 __all__ = ["DrawnPoints", "FreshPoints", "draw_steps"]
 
@@ -80,10 +80,16 @@ class FreshPoints:
         vertices, faces = sequence.vertices(frame), sequence.faces(frame)
         lower, upper = sequence.cube(frame)
         uniform = lower + random.random((self.uniform, 3)) * (upper - lower)
-        near = uniform_surface_samples(vertices, faces, self.surface, random)
+        is_planar = self.settings.get("is_planar", False)  # only samples of the plane z = 0 say so
+        near = (outline_samples if is_planar else uniform_surface_samples)(vertices, faces, self.surface, random)
         near += random.normal(scale=self.settings["surface_noise_m"], size=near.shape)
         points = np.clip(np.concatenate([uniform, near]), lower, upper).astype(np.float32)  # as the stored points are
-        return points, occupancies(vertices, faces, points, self.settings["inside_test"])
+        if is_planar:
+            points[:, 2] = 0.0
+        inside = occupancies(vertices, faces, points, self.settings["inside_test"])
+        if is_planar and self.settings["inside_test"] == "winding":
+            inside |= in_turned_over(vertices, faces, points)
+        return points, inside
 
 
 def draw_steps(points: FreshPoints, first: int, stride: int) -> Iterator[DrawnPoints]:

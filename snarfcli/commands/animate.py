@@ -141,6 +141,7 @@ def run(config: AnimateConfig) -> int:
     device = choose_device(config.device)
     set_threads(config.threads)
     avatar = Avatar.load(path, device)
+    _check_system(config, avatar)
     whole, transforms = _read(config, avatar.skeleton)
     motion, numbers = _selected(config, whole)
     transforms = None if transforms is None else transforms[numbers]
@@ -212,6 +213,18 @@ def _check(config: AnimateConfig) -> tuple[int, int]:
             f"video_size must be a number such as 512 or 1280x720, 16 to {_LARGEST_PICTURE}, got {config.video_size}"
         )
     return numbers
+
+
+def _check_system(config: AnimateConfig, avatar: Avatar) -> None:
+    """Refuse what needs skinning weights of an avatar without any."""
+    if avatar.model.has_skinning_weights:
+        return
+    wanted = "surface=skinned" if config.surface == "skinned" else "weight_colors=true" if config.weight_colors else None
+    if wanted:
+        raise UserError(
+            f"{wanted} needs skinning weights of canonical points, which model {avatar.config.model.name} does not have; "
+            "leave it out, or take an avatar of model=fast_snarf"
+        )
 
 
 def _read(config: AnimateConfig, skeleton: Skeleton) -> tuple[Motion, NDArray[np.float32] | None]:
@@ -292,8 +305,8 @@ def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
 
 
 def _canonical(config: AnimateConfig, avatar: Avatar, motion: Motion) -> Mesh | None:
-    """Return the canonical body in the first pose, for colours and camera; None without need or if it has no surface."""
-    if not (config.video or config.weight_colors):
+    """Return the canonical body in the first pose, for colours and camera; None without need or if there is none."""
+    if not (config.video or config.weight_colors) or not avatar.model.has_skinning_weights:
         return None
     resolution = min(128, config.resolution) if config.weight_colors else min(64, config.resolution)
     try:

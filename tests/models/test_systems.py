@@ -1,0 +1,221 @@
+"""The systems of the papers: what each does with a point, and what all of them have in common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from toy_training import avatar_config, toy_store, training_config
+from torch import nn
+from torch.nn import functional as F
+
+from snarfcli.deformer import CanonicalGrid, SearchConfig
+from snarfcli.deformer.skinning import skin
+from snarfcli.models.avatar import SYSTEMS, Avatar
+from snarfcli.models.nasa import PartNetworks
+from snarfcli.models.pointwise import invert_blended
+from snarfcli.models.settings import ModelConfig
+from snarfcli.models.smpl_nn import nearest_vertex
+from snarfcli.models.system import MeshTemplate
+from snarfcli.training.extent import rough_canonical_points
+from snarfcli.training.trainer import Trainer
+
+CPU = torch.device("cpu")
+POSES = torch.tensor([[[0.0, 0.0, 0.3], [0.0, 0.0, 0.9]], [[0.0, 0.4, 0.0], [0.2, 0.0, -0.7]]])
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return toy_store(tmp_path_factory.mktemp("data"), points=400, frames=12)
+
+
+def template_of(store) -> MeshTemplate:
+    return MeshTemplate(torch.tensor(store.template.vertices), torch.tensor(store.template.weights).float())
+
+
+def new_system(store, name: str, *, condition: str = "global", as_it_starts: bool = False, **changes) -> Avatar:
+    """Return an untrained avatar of one system; what its networks put out is made visible, unless it is wanted `as_it_starts`."""
+    config = avatar_config(capsules=True, condition=condition)
+    config = replace(config, model=ModelConfig(name, **changes))
+    if name == "snarf":
+        config = replace(config, search=SearchConfig("broyden", max_steps=20))
+    surface = rough_canonical_points(store)
+    grid = CanonicalGrid.around(surface, config.skinning.margin_m)
+    torch.manual_seed(0)
+    avatar = Avatar(config, store.skeleton, grid, surface, {}, template=template_of(store))
+    with torch.no_grad():
+        for parameter in () if as_it_starts else avatar.model.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return avatar.to("cpu")
+
+
+def points_near(avatar: Avatar, transforms: torch.Tensor, count: int = 300) -> torch.Tensor:
+    """Return points [B, count, 3] in the posed boxes."""
+    generator = torch.Generator().manual_seed(1)
+    boxes = [avatar.posed_box(one) for one in transforms]
+    return torch.stack([lower + torch.rand(count, 3, generator=generator) * (upper - lower) for lower, upper in boxes])
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_where_a_body_stands_changes_nothing(store, name):
+    """The field moves with the body, through the root's global orientation too."""
+    avatar = new_system(store, name)
+    transforms = avatar.bone_transforms(POSES)
+    points = points_near(avatar, transforms)
+    moved = torch.eye(4)
+    moved[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0.0, -1.1, 0.4], [1.1, 0, -0.2], [-0.4, 0.2, 0]]))
+    moved[:3, 3] = torch.tensor([0.3, -0.2, 0.5])
+    here = avatar.query(points, transforms, POSES)
+    there = avatar.query(points @ moved[:3, :3].T + moved[:3, 3], moved @ transforms, POSES)
+    spread = float(here.logits.std())
+    same = (here.logits - there.logits).abs() < 0.02 * spread
+    # a point on a cell's face, or on the border between two vertices' regions, may fall to either side
+    assert float(same.float().mean()) > 0.98
+    assert spread > 1e-3
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_files_keep_the_field(store, name, tmp_path):
+    avatar = new_system(store, name)
+    avatar.save(tmp_path / "avatar.pt")
+    again = Avatar.load(tmp_path / "avatar.pt")
+    transforms = avatar.bone_transforms(POSES)
+    points = points_near(avatar, transforms)
+    assert torch.equal(again.query(points, transforms, POSES).logits, avatar.query(points, transforms, POSES).logits)
+    for mine, theirs in zip(avatar.posed_box(transforms[0]), again.posed_box(transforms[0]), strict=True):
+        assert torch.equal(mine, theirs)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_training_lowers_the_loss_and_reaches_every_weight(store, name):
+    avatar = new_system(store, name, as_it_starts=True)
+    trainer = Trainer(avatar, store, training_config(steps=40, bootstrap_steps=40), 0, CPU)
+    before = [p.detach().clone() for p in trainer.parameters]
+    numbers = [trainer.advance() for _ in range(40)]
+    first, last = (sum(n["occupancy"] for n in part) / 5 for part in (numbers[:5], numbers[-5:]))
+    assert last < 0.9 * first
+    assert all(bool((p != old).any()) for p, old in zip(trainer.parameters, before, strict=True) if p.numel())
+    assert ("parts" in numbers[0]) == (name in ("nasa", "piecewise"))
+    assert ("joint_weight" in numbers[0]) == (name in ("fast_snarf", "snarf", "back_lbs"))
+
+
+def test_blended_transforms_are_inverted():
+    generator = torch.Generator().manual_seed(0)
+    canonical = torch.rand(2, 50, 3, generator=generator, dtype=torch.float64)
+    weights = torch.softmax(torch.randn(2, 50, 4, generator=generator, dtype=torch.float64), -1)
+    turns = 0.6 * torch.randn(2, 4, 3, generator=generator, dtype=torch.float64)
+    zeros = torch.zeros_like(turns[..., 0])
+    x, y, z = turns.unbind(-1)
+    generators = torch.stack([zeros, -z, y, z, zeros, -x, -y, x, zeros], -1).unflatten(-1, (3, 3))
+    transforms = torch.eye(4, dtype=torch.float64).repeat(2, 4, 1, 1)
+    transforms[..., :3, :3] = torch.linalg.matrix_exp(generators)
+    transforms[..., :3, 3] = torch.randn(2, 4, 3, generator=generator, dtype=torch.float64)
+    posed = torch.stack([skin(*one) for one in zip(canonical, weights, transforms, strict=True)])
+    torch.testing.assert_close(invert_blended(posed, weights, transforms), canonical, atol=1e-9, rtol=0)
+    inputs = [posed[:, :3].clone().requires_grad_(), weights[:, :3].clone().requires_grad_()]
+    assert torch.autograd.gradcheck(lambda p, w: invert_blended(p, w, transforms), inputs)
+
+
+def test_opposite_rotations_send_points_away_and_nowhere_else():
+    turned = torch.eye(4).repeat(1, 2, 1, 1)
+    turned[0, 1, :2, :2] *= -1  # by half a turn about z
+    out = invert_blended(torch.tensor([[[0.3, 0.2, 0.1]]]), torch.tensor([[[0.5, 0.5]]]), turned)
+    assert bool(out.isfinite().all())
+
+
+def test_smpl_nn_takes_the_vertices_of_the_base_mesh_home(store):
+    avatar = new_system(store, "smpl_nn")
+    template = template_of(store)
+    transforms = avatar.bone_transforms(POSES)
+    posed = torch.stack([skin(template.vertices, template.weights, one) for one in transforms])
+    canonical, weights = avatar.model.canonical_points(posed, transforms, POSES)
+    torch.testing.assert_close(canonical, template.vertices.expand_as(canonical), atol=1e-5, rtol=0)
+    assert torch.equal(weights, template.weights.expand_as(weights))
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(nearest_vertex(points, posed[0]), torch.cdist(points.double(), posed[0].double()).argmin(1))
+
+
+def test_back_lbs_starts_from_the_distances_to_the_posed_bones(store):
+    avatar = new_system(store, "back_lbs")
+    with torch.no_grad():
+        avatar.model.weight_network.layers[-1].weight.zero_()
+        avatar.model.weight_network.layers[-1].bias.zero_()
+    transforms = avatar.bone_transforms(POSES)
+    joints = avatar.skeleton.canonical_joints
+    posed = torch.einsum("bjrc,jc->bjr", transforms[:, :, :3, :3], joints) + transforms[:, :, :3, 3]
+    points = points_near(avatar, transforms, 100)
+    # the first joint moves the segment to the second; the second, a last one, the point where it is
+    start, along = posed[:, :1], posed[:, 1:] - posed[:, :1]
+    share = (((points - start) * along).sum(-1) / (along * along).sum(-1)).clamp(0, 1)[..., None]
+    distances = torch.stack([(points - start - share * along).norm(dim=-1), (points - posed[:, 1:]).norm(dim=-1)], -1)
+    wanted = torch.softmax(-distances / avatar.config.skinning.prior_falloff_m, -1)
+    torch.testing.assert_close(avatar.model.posed_weights(points, transforms, POSES), wanted, atol=1e-4, rtol=0)
+
+
+def test_parts_are_as_many_networks_of_their_own():
+    torch.manual_seed(0)
+    parts = PartNetworks(ModelConfig("nasa", part_width=8, part_depth=2, part_code=2), 3)
+    local, roots = torch.randn(2, 3, 7, 3), torch.randn(2, 3, 3)
+    out = parts(local, roots)
+    for part in range(3):
+        layers = []
+        for weight, bias in zip(parts.weights, parts.biases, strict=True):
+            layer = nn.Linear(*weight.shape[1:])
+            layer.weight.data, layer.bias.data = weight[part].T, bias[part, 0]
+            layers += [layer, nn.LeakyReLU(0.1)]
+        network = nn.Sequential(*layers[:-1])
+        for pose in range(2):
+            code = roots[pose].reshape(-1) @ parts.reduce[part]
+            inputs = torch.cat([local[pose, part], code.expand(7, -1)], 1)
+            torch.testing.assert_close(out[pose, part], network(inputs)[:, 0], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "deforms"), [("nasa", True), ("piecewise", False)])
+def test_a_part_moves_with_its_bone_and_deforms_or_not(store, name, deforms):
+    avatar = new_system(store, name, part_code=4)
+    transforms = avatar.bone_transforms(POSES)
+    canonical = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
+    moved = torch.einsum("brc,nc->bnr", transforms[:, 1, :3, :3], canonical) + transforms[:, 1, None, :3, 3]
+    first, second = avatar.model.part_logits(moved, transforms)[:, 1].detach()
+    assert torch.allclose(first, second, atol=1e-4) != deforms
+    union = avatar.query(moved, transforms, POSES).logits
+    torch.testing.assert_close(union, avatar.model.part_logits(moved, transforms).amax(1).detach())
+
+
+def test_surface_points_belong_to_one_part(store):
+    avatar = new_system(store, "nasa", part_weight=2.0, part_points=64)
+    template, generator = template_of(store), torch.Generator().manual_seed(3)
+    transforms = avatar.bone_transforms(POSES)
+    loss = avatar.model.extra_losses(transforms, POSES, generator)["parts"]
+    chosen = torch.randint(len(template.vertices), (64,), generator=torch.Generator().manual_seed(3))
+    wanted = 0.0
+    for one in transforms:
+        posed = skin(template.vertices[chosen], template.weights[chosen], one)
+        occupancy = avatar.model.part_logits(posed[None], one[None])[0].sigmoid().T  # [N, J]
+        wanted += F.mse_loss(occupancy, 0.5 * F.one_hot(template.weights[chosen].argmax(1), 2).float()) / len(transforms)
+    torch.testing.assert_close(loss, 2.0 * wanted)
+
+
+@pytest.mark.parametrize("name", ["pose_onet", "back_d", "nasa"])
+def test_local_condition_needs_skinning_weights(store, name):
+    with pytest.raises(ValueError, match=f"model {name} has no skinning weights for condition=local"):
+        new_system(store, name, condition="local")
+
+
+@pytest.mark.parametrize("name", ["back_lbs", "smpl_nn", "snarf"])
+def test_local_condition_shows_each_point_the_joints_that_move_it(store, name):
+    avatar = new_system(store, name, condition="local")
+    transforms = avatar.bone_transforms(POSES)
+    samples = avatar.query(points_near(avatar, transforms), transforms, POSES)
+    assert bool(samples.logits.isfinite().all())
+
+
+def test_what_a_system_lacks_is_refused(store):
+    avatar = new_system(store, "nasa")
+    with pytest.raises(ValueError, match="model nasa has no canonical shape"):
+        avatar.mesh(POSES[0], resolution=16, surface="skinned")
+    with pytest.raises(ValueError, match="model nasa searches no correspondences, got search.name 'broyden'"):
+        avatar.model.choose_search(SearchConfig("broyden"))
+    with pytest.raises(ValueError, match="model back_d has no skinning weights"):
+        new_system(store, "back_d").skinning_weights(torch.zeros(1, 3))

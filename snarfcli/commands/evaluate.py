@@ -19,6 +19,7 @@ from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import evaluate
 from snarfcli.evaluation.report import SPLITS, Evaluation, metrics_content, table, timings_text
 from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
+from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
 from snarfcli.files import write_json
 from snarfcli.models.avatar import Avatar
 from snarfcli.models.start_bones import with_start_bones
@@ -132,9 +133,12 @@ def run(config: EvalConfig) -> None:
     if config.surface_frames:
         surfaces = measure_surfaces(avatar, sequences, config.surface_frames, config.surface_resolution)
         log.info("%s", surfaces_text(surfaces))
+    weights = measure_weights(avatar, store.template)
+    if weights is not None:
+        log.info("%s", weights_text(weights))
     (folder / "frames.png").unlink(missing_ok=True)  # an older figure would not belong to these numbers
     content = metrics_content(evaluation, {**asdict(config), "avatar": str(path)})
-    write_json(folder / "metrics.json", {**content, "surfaces": surfaces})
+    write_json(folder / "metrics.json", {**content, "surfaces": surfaces, "weights": weights})
     log.info("metrics: %s", folder / "metrics.json")
     if config.figure:
         from snarfcli.evaluation.figure import write_figure

@@ -20,10 +20,10 @@ _POINTS_AT_ONCE = 100_000  # points in one query, which bounds the memory of the
 
 
 class FieldValues(Protocol):
-    """What is needed of an answer of the field; see `snarfcli.models.fast_snarf.FieldSamples`."""
+    """What is needed of an answer of the field; see `snarfcli.models.system.FieldSamples`."""
 
     logits: Tensor
-    found: Tensor
+    counts: Tensor
     search_s: float
     shape_s: float
 
@@ -141,7 +141,7 @@ def measure_frame(avatar: Field, sequence: Samples, index: int, chosen: np.ndarr
     """
     points, occupied = sequence.points(index, chosen), sequence.occupancies(index, chosen)
     uniform = sequence.num_uniform if chosen is None else int(np.searchsorted(chosen, sequence.num_uniform))
-    inside, found, search_s, shape_s, total_s = _query(avatar, sequence, index, points)
+    inside, counts, search_s, shape_s, total_s = _query(avatar, sequence, index, points)
     in_tight_box = in_box(points[:uniform], *sequence.box(index))
     return FrameMetrics(
         sequence=sequence.name,
@@ -151,9 +151,11 @@ def measure_frame(avatar: Field, sequence: Samples, index: int, chosen: np.ndarr
         iou_surface=float(iou(inside[uniform:], occupied[uniform:])),
         iou_tight_box=float(iou(inside[:uniform], occupied[:uniform], in_tight_box)),
         points=len(points),
-        without=int((~found).sum()),
+        correspondences=int(counts.sum()),
+        several=int((counts > 1).sum()),
+        without=int((counts == 0).sum()),
         inside=int(occupied.sum()),
-        inside_without=int((occupied & ~found).sum()),
+        inside_without=int((occupied & (counts == 0)).sum()),
         search_s=search_s,
         shape_s=shape_s,
         total_s=total_s,
@@ -175,9 +177,9 @@ def _posed(sequence: Samples, index: int) -> tuple[Tensor, Tensor]:
 def _query(
     avatar: Field, sequence: Samples, index: int, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float, float, float]:
-    """Return which points [N, 3] are inside and which have a correspondence, [N] bool, and the seconds it took."""
+    """Return which points [N, 3] are inside, bool [N], how many correspondences each has, [N], and the seconds it took."""
     transforms, pose = _posed(sequence, index)
-    inside, found, search_s, shape_s, total_s = [], [], 0.0, 0.0, 0.0
+    inside, counts, search_s, shape_s, total_s = [], [], 0.0, 0.0, 0.0
     for part in torch.as_tensor(points).split(_POINTS_AT_ONCE):
         start = time.perf_counter()
         values = avatar.query(part[None], transforms, pose)
@@ -191,5 +193,5 @@ def _query(
         # queued by then, so the rest of the time is the network's.
         shape_s += max(seconds - values.search_s, 0.0) if on_gpu else values.shape_s
         inside.append((values.logits[0] > 0).cpu().numpy())
-        found.append(values.found[0].cpu().numpy())
-    return np.concatenate(inside), np.concatenate(found), search_s, shape_s, total_s
+        counts.append(values.counts[0].cpu().numpy())
+    return np.concatenate(inside), np.concatenate(counts), search_s, shape_s, total_s

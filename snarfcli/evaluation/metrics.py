@@ -35,6 +35,10 @@ class FrameMetrics:
     """IoU of the uniform points in the tight box of the posed mesh, 0 to 1."""
     points: int
     """Number of points."""
+    correspondences: int
+    """Correspondences of all points together."""
+    several: int
+    """Points with more than one correspondence: where the body touches or crosses itself."""
     without: int
     """Points without a correspondence."""
     inside: int
@@ -65,6 +69,10 @@ class Summary:
     """Mean over frames, 0 to 1."""
     worst_iou_surface: float
     """Lowest of all frames, 0 to 1."""
+    correspondences_per_point: float
+    """Mean number of correspondences of a point that has any."""
+    several: float
+    """Share of points with more than one correspondence, 0 to 1."""
     without: float
     """Share of points without a correspondence, 0 to 1."""
     inside_without: float
@@ -124,7 +132,9 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
         raise ValueError("frames: wanted at least one frame, got none")
     total = {
         name: sum(getattr(frame, name) for frame in frames)
-        for name in ("points", "without", "inside", "inside_without", "search_s", "shape_s", "total_s")
+        for name in (
+            "points", "correspondences", "several", "without", "inside", "inside_without", "search_s", "shape_s", "total_s"
+        )  # fmt: skip
     }
     return Summary(
         frames=len(frames),
@@ -133,6 +143,8 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
         iou_surface=float(np.mean([frame.iou_surface for frame in frames])),
         iou_tight_box=float(np.mean([frame.iou_tight_box for frame in frames])),
         worst_iou_surface=min(frame.iou_surface for frame in frames),
+        correspondences_per_point=total["correspondences"] / max(total["points"] - total["without"], 1),
+        several=total["several"] / max(total["points"], 1),
         without=total["without"] / max(total["points"], 1),
         inside_without=total["inside_without"] / max(total["inside"], 1),
         search_s=total["search_s"],

@@ -53,7 +53,7 @@ class BallAvatar:
         distance = (points - bone_transforms[:, 0, None, :3, 3]).norm(dim=-1)
         found = distance < self.reach
         logits = torch.where(found, self.radius - distance, -30.0)
-        return SimpleNamespace(logits=logits, found=found, search_s=1.0, shape_s=2.0)
+        return SimpleNamespace(logits=logits, counts=found.long(), search_s=1.0, shape_s=2.0)
 
 
 def test_the_right_ball_is_perfect():

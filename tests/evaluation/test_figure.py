@@ -13,7 +13,7 @@ from snarfcli.evaluation.metrics import FrameMetrics
 
 def frame(sequence: str, number: int, surface: float) -> FrameMetrics:
     """Return a frame of which only the name and the surface IoU matter."""
-    return FrameMetrics(sequence, number, number, 0.9, surface, 0.9, 10, 0, 0, 0, 0.0, 0.0, 0.0)
+    return FrameMetrics(sequence, number, number, 0.9, surface, 0.9, 10, 10, 0, 0, 0, 0, 0.0, 0.0, 0.0)
 
 
 def names(frames) -> list[tuple[str, int]]:

@@ -73,9 +73,15 @@ def test_the_border_of_a_box_is_inside():
     np.testing.assert_array_equal(in_box(points, np.zeros(3), np.array([1, 2, 3])), mask("###..."))
 
 
-FRAME = FrameMetrics("walk", 0, 0, 0.9, 0.8, 0.7, 100, 40, 10, 1, 0.1, 0.2, 0.5)
+FRAME = FrameMetrics("walk", 0, 0, 0.9, 0.8, 0.7, 100, 90, 20, 40, 10, 1, 0.1, 0.2, 0.5)
 WALK = [FRAME, replace(FRAME, index=1, frame=4, iou_bbox=0.5, iou_surface=0.4, iou_tight_box=0.3)]
-JUMP = [FrameMetrics("jump", 0, 0, 0.1, 0.2, 0.3, 100, 100, 0, 0, 0.1, 0.2, 0.5)]
+JUMP = [FrameMetrics("jump", 0, 0, 0.1, 0.2, 0.3, 100, 0, 0, 100, 0, 0, 0.1, 0.2, 0.5)]
+
+
+def test_correspondences_are_counted_over_the_points_that_have_any():
+    summary = summarise(WALK + JUMP)
+    assert summary.correspondences_per_point == pytest.approx(180 / 120)
+    assert summary.several == pytest.approx(40 / 300)
 
 
 def test_every_frame_counts_the_same():

@@ -13,7 +13,7 @@ from snarfcli.evaluation.metrics import FrameMetrics
 from snarfcli.evaluation.report import Evaluation, metrics_content, plain, table, timings_text
 from snarfcli.files import write_json
 
-FRAME = FrameMetrics("walk", 0, 0, 0.9625, 0.87, 0.955, 1000, 400, 100, 1, 0.001, 0.004, 0.006)
+FRAME = FrameMetrics("walk", 0, 0, 0.9625, 0.87, 0.955, 1000, 900, 200, 400, 100, 1, 0.001, 0.004, 0.006)
 FRAMES = [
     FRAME,
     replace(FRAME, index=1, frame=4, iou_bbox=0.9525, iou_surface=0.85),

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from toy_training import avatar_config, toy_store, training_config
 from torch import nn
 from torch.nn import functional as F
+from toy_training import avatar_config, toy_store, training_config
 
 from snarfcli.deformer import CanonicalGrid, SearchConfig
 from snarfcli.deformer.skinning import skin
@@ -35,7 +35,7 @@ def template_of(store) -> MeshTemplate:
 
 
 def new_system(store, name: str, *, condition: str = "global", as_it_starts: bool = False, **changes) -> Avatar:
-    """Return an untrained avatar of one system; what its networks put out is made visible, unless it is wanted `as_it_starts`."""
+    """Return an untrained avatar of one system; with its weights disturbed, unless it is wanted `as_it_starts`."""
     config = avatar_config(capsules=True, condition=condition)
     config = replace(config, model=ModelConfig(name, **changes))
     if name == "snarf":

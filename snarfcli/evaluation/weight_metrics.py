@@ -1,0 +1,55 @@
+"""How far learned skinning weights are from the ones that the posed meshes were made with.
+
+Both are compared at the vertices of the body's mesh in the canonical pose. The difference of two rows of weights is half the
+sum of its absolute values (the total variation distance): the share of a vertex's weight that is on the wrong bones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from snarfcli.datasets.subjects import Template
+    from snarfcli.models.avatar import Avatar
+
+__all__ = ["compare_weights", "measure_weights", "weights_text"]
+
+_POINTS_AT_ONCE = 65_536
+
+
+def measure_weights(avatar: Avatar, template: Template | None) -> dict[str, Any] | None:
+    """Compare an avatar's weights with those of the subject's mesh; None where either has none.
+
+    Args:
+        avatar: the avatar.
+        template: mesh and true weights in the canonical pose.
+    """
+    if template is None or not avatar.model.has_skinning_weights:
+        return None
+    vertices = torch.as_tensor(np.asarray(template.vertices), dtype=torch.float32)
+    learned = torch.cat([avatar.skinning_weights(part).cpu() for part in vertices.split(_POINTS_AT_ONCE)])
+    return compare_weights(learned.double().numpy(), np.asarray(template.weights, np.float64))
+
+
+def compare_weights(learned: NDArray, true: NDArray) -> dict[str, Any]:
+    """Return what `metrics.json` says of learned weights [V, J] beside the true ones [V, J]; all shares from 0 to 1."""
+    share = np.abs(learned - true).sum(1) / 2
+    return {
+        "wrong_share": float(share.mean()),
+        "wrong_share_p95": float(np.quantile(share, 0.95)),
+        "right_bone": float((learned.argmax(1) == true.argmax(1)).mean()),
+        "vertices": len(true),
+    }
+
+
+def weights_text(weights: Mapping[str, Any]) -> str:
+    """Return one line about what `measure_weights` found."""
+    return (
+        f"skinning weights at {weights['vertices']:,} vertices: {100 * weights['wrong_share']:.1f} % on wrong bones "
+        f"(95 % quantile {100 * weights['wrong_share_p95']:.1f} %), heaviest bone right at {100 * weights['right_bone']:.1f} %"
+    )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from snarfcli.sampling import winding_numbers
 
@@ -20,7 +21,8 @@ _CELL_M = 0.012  # folds are 5 cm long and more; half of it gives four times the
 _BAND_M = 0.03  # cloth spans hollows narrower than about twice this
 _LEAST_STAND_OFF_M = 0.012
 _SAME_M = 1e-5  # the union moves no vertex further than its files' single precision does
-_NEIGHBOURS = 400  # of 6,890 body vertices: weights fall to 1e-3 of the nearest's before that
+_NEIGHBOURS = 400  # of 6,890 body vertices
+_LEAST_SHARE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -49,19 +51,12 @@ class ClothedMesh:
     """[F, 3] vertex numbers, outward."""
     stand_off_m: NDArray[np.float64]
     """[V] distance from the body; 0 for skin."""
-    followed: NDArray[np.int64]
-    """[V, K] vertices of the body that each vertex follows."""
-    shares: NDArray[np.float64]
-    """[V, K] how much it follows each; rows sum to 1."""
+    shares: csr_matrix
+    """[V, B] how much each vertex follows each of the body's; rows sum to 1."""
 
-    def follow(self, values: NDArray) -> NDArray:
-        """Return what the vertices have [V, ...] of what the body's have [B, ...]."""
-        flat = values.reshape(len(values), -1)
-        out = np.empty((len(self.vertices), flat.shape[1]))
-        for start in range(0, len(out), 2000):  # all at once is large
-            part = slice(start, start + 2000)
-            out[part] = np.einsum("vk,vkc->vc", self.shares[part], flat[self.followed[part]])
-        return out.reshape(-1, *values.shape[1:])
+    def follow(self, values: NDArray) -> NDArray[np.float64]:
+        """Return what the vertices have [V, C] of what the body's have [B, C]."""
+        return self.shares @ np.asarray(values, np.float64)
 
 
 def dress(vertices: NDArray, faces: NDArray, joints: dict[str, NDArray], outfit: Outfit) -> ClothedMesh:
@@ -80,8 +75,7 @@ def dress(vertices: NDArray, faces: NDArray, joints: dict[str, NDArray], outfit:
     cloth = _cloth(vertices, faces, joints, outfit)
     joined, joined_faces = _union((vertices, faces), cloth)
     stand_off = _distance(vertices, faces, joined)
-    followed, shares = _followed(vertices, faces, joined, stand_off)
-    return ClothedMesh(joined, joined_faces, stand_off, followed, shares)
+    return ClothedMesh(joined, joined_faces, stand_off, _shares(vertices, faces, joined, stand_off))
 
 
 def _cloth(vertices: NDArray, faces: NDArray, joints: dict[str, NDArray], outfit: Outfit) -> tuple[NDArray, NDArray]:
@@ -182,8 +176,8 @@ def _distance(vertices: NDArray, faces: NDArray, points: NDArray) -> NDArray[np.
     return np.sqrt(np.asarray(igl.point_mesh_squared_distance(points, vertices, faces)[0]).reshape(-1))
 
 
-def _followed(vertices: NDArray, faces: NDArray, joined: NDArray, stand_off: NDArray) -> tuple[NDArray, NDArray]:
-    """Return which vertices of the body each vertex of the joined mesh follows, [V, K], and how much."""
+def _shares(vertices: NDArray, faces: NDArray, joined: NDArray, stand_off: NDArray) -> csr_matrix:
+    """Return how much each vertex of the joined mesh follows each of the body's, [V, B]."""
     import igl
     from scipy.spatial import cKDTree
 
@@ -199,7 +193,10 @@ def _followed(vertices: NDArray, faces: NDArray, joined: NDArray, stand_off: NDA
     a, b, c = (np.ascontiguousarray(vertices[corners[:, i]]) for i in range(3))
     followed[skin, :3], shares[skin] = corners, 0
     shares[skin, :3] = _barycentric(np.asarray(closest), a, b, c)
-    return followed, shares
+    shares[shares < _LEAST_SHARE] = 0
+    shares /= shares.sum(axis=1, keepdims=True)
+    row, column = np.nonzero(shares)
+    return csr_matrix((shares[row, column], (row, followed[row, column])), shape=(len(joined), len(vertices)))
 
 
 def _barycentric(points: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray[np.float64]:

@@ -24,10 +24,10 @@ PROTOCOL = {
     "iou_tight_box": "the uniform points that lie in the tight box of the posed mesh",
     "averaging": "mean over all frames of the IoU of each frame; a sequence's value is the mean over its frames",
     "empty_sets": "the IoU of two empty sets is 1",
-    "correspondences_per_point": "mean over points that have any; several: share of all points that have more than one",
+    "correspondences_per_point": "mean over points that have any; several_correspondences: share of points with two or more",
     "without_correspondence": "shares of the points of all frames together",
-    "weights": "at the vertices of the body's mesh in the canonical pose, against its own weights; wrong_share: half the sum of "
-    "the absolute differences over bones; right_bone: share of vertices whose heaviest bone is the same",
+    "weights": "at the vertices of the body's mesh in the canonical pose, against its own; wrong_share: half the sum "
+    "of the absolute differences over bones; right_bone: share of vertices whose heaviest bone is the same",
     "surfaces": "Chamfer: mean of the two mean distances; normals: mean cosine at nearest places; F-score: within 5 mm",
     "timings": "one untimed call first; times for 200,000 points are scaled from calls of points_per_frame points",
 }

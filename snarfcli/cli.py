@@ -14,7 +14,16 @@ from typing import Any
 
 import snarfcli
 from snarfcli.errors import UserError, nearest
-from snarfcli.settings import check_overrides, config_folder, describe, group_options, group_schemas, preset_groups
+from snarfcli.settings import (
+    check_overrides,
+    config_folder,
+    describe,
+    group_options,
+    group_schemas,
+    preset_groups,
+    quote,
+    quote_items,
+)
 
 __all__ = ["COMMANDS", "Command", "main", "register_schemas"]
 
@@ -40,6 +49,14 @@ class Command:
     """A call that works on a fresh machine once the commands before it have run."""
     flags: dict[str, str]
     """Flags and the overrides they stand for; `{}` takes the flag's value."""
+    positional: str | None = None
+    """Setting whose value may stand first, without its name."""
+    lists_of_settings: tuple[str, ...] = ()
+    """Settings whose value is a list of settings."""
+    folder: str = ""
+    """Folder of its configuration below conf/. Outside of it there are groups, whose names its settings may have therefore."""
+    is_hidden: bool = False
+    """Whether it is only for the program itself."""
 
 
 _COMMANDS = (
@@ -83,6 +100,27 @@ _COMMANDS = (
         "snarf doctor",
         {},
     ),
+    Command(
+        "reproduce",
+        "reproduce",
+        "ReproduceConfig",
+        "the papers' tables and figures: table1, table2, ablations, stick2d, clothed or all",
+        "snarf reproduce table1 subjects=[50002,50004] training=quick",
+        {"--dry-run": "dry_run=true"},
+        positional="what",
+        lists_of_settings=("extra", "launcher_settings"),
+        folder="reproduce",
+    ),
+    Command(
+        "reproduce_job",
+        "reproduce_job",
+        "ReproduceJobConfig",
+        "one run of a plan, started by Hydra's launchers",
+        "snarf reproduce_job plan=plan.json job=0",
+        {},
+        folder="reproduce",
+        is_hidden=True,
+    ),
 )
 COMMANDS = {command.name: command for command in _COMMANDS} | {"evaluate": _COMMANDS[2]}
 
@@ -110,8 +148,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"snarf {snarfcli.__version__}")
         return 0
     if arguments[0] not in COMMANDS:
-        hint = nearest(arguments[0], COMMANDS)
-        print(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(COMMANDS)}", file=sys.stderr)
+        hint = nearest(arguments[0], _shown())
+        print(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(_shown())}", file=sys.stderr)
         return EXIT_USER_ERROR
     command = COMMANDS[arguments[0]]
     _set_up_logging()
@@ -163,7 +201,8 @@ def _run(command: Command, arguments: list[str]) -> int:
         except Exception as error:  # Hydra would print it in its own way; the next job of a multirun still runs
             codes.append(_report(command, error))
 
-    entry: Callable[[], None] = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=command.name)(job)
+    folder = str(config_folder() / command.folder)
+    entry: Callable[[], None] = hydra.main(version_base="1.3", config_path=folder, config_name=command.name)(job)
     # Hydra would print errors of the configuration in its own way and end the process; so it hands them to `main`.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     before = sys.argv
@@ -183,6 +222,8 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
     out: list[str] = []
     flags: list[str] = []
     rest = list(arguments)
+    if command.positional and rest and "=" not in rest[0] and not rest[0].startswith(("-", "~")):
+        out.append(f"{command.positional}={quote(rest.pop(0))}")
     while rest:
         argument = rest.pop(0)
         name, equals, value = argument.partition("=")
@@ -193,7 +234,7 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
                     if not rest:
                         raise UserError(f"{name} needs a value, such as {name} FILE")
                     value = rest.pop(0)
-                override = override.format(_quote(value))
+                override = override.format(quote(value))
             elif equals:
                 raise UserError(f"{name} takes no value, got {argument!r}")
             out.append(override)
@@ -207,7 +248,7 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
         elif not equals or argument.startswith("~"):
             raise UserError(f"{argument!r} is no setting; write name=value; see \"snarf {command.name} --help\"")
         else:
-            out.append(argument)
+            out.append(f"{name}={quote_items(value)}" if name in command.lists_of_settings else argument)
     return out + flags
 
 
@@ -217,11 +258,9 @@ def _in_group(override: str, presets: dict[str, str]) -> str:
     return f"{presets.get(name, name)}={value}"
 
 
-def _quote(value: str) -> str:
-    """Return a value that Hydra's grammar reads back unchanged, whatever characters a file name has."""
-    # Within quotes only a quote is special, and so are the backslashes that lead up to one.
-    escaped = re.sub(r"(\\*)('|$)", lambda match: match.group(1) * 2 + ("\\'" if match.group(2) else ""), value)
-    return f"'{escaped}'"
+def _shown() -> list[str]:
+    """Return the names of the commands that are for people."""
+    return [name for name, command in COMMANDS.items() if not command.is_hidden]
 
 
 def register_schemas(name: str, schema: type) -> None:
@@ -306,7 +345,7 @@ def _set_up_logging() -> None:
 
 def _overview() -> str:
     """Return the help of `snarf` itself."""
-    rows = "\n".join(f"  {command.name:<12}{command.summary}" for command in _COMMANDS)
+    rows = "\n".join(f"  {command.name:<12}{command.summary}" for command in _COMMANDS if not command.is_hidden)
     return (
         "snarf learns an animatable avatar of one subject from posed meshes.\n\n"
         f"usage: snarf COMMAND [FLAGS] [SETTING=VALUE ...]\n\n{rows}\n\n"

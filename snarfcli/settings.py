@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import re
 import textwrap
 import typing
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,8 @@ __all__ = [
     "group_options",
     "group_schemas",
     "preset_groups",
+    "quote",
+    "quote_items",
     "setting_names",
 ]
 
@@ -116,3 +119,32 @@ def _values(override: Any) -> list[Any]:
     if override.is_sweep_override():
         return [value.strip("'\"") for value in override.sweep_string_iterator()]
     return [override.value()]
+
+
+def quote(value: str) -> str:
+    """Return a value that Hydra's grammar reads back as the same text, whatever characters it has."""
+    # Within quotes only a quote is special, and so are the backslashes that lead up to one.
+    escaped = re.sub(r"(\\*)('|$)", lambda match: match.group(1) * 2 + ("\\'" if match.group(2) else ""), value)
+    return f"'{escaped}'"
+
+
+def quote_items(value: str) -> str:
+    """Return a list of settings, such as [training.steps=9,skinning.resolution=[8,8,4]], as Hydra reads it: items in quotes.
+
+    Hydra's grammar has no bare = inside of a list. What is no list in brackets, and items in quotes, stay as they are.
+    """
+    if not (value.startswith("[") and value.endswith("]")):
+        return value
+    items, depth, inside = [""], 0, ""
+    for letter in value[1:-1]:
+        if letter == inside:
+            inside = ""
+        elif not inside and letter in "'\"":
+            inside = letter
+        depth += 0 if inside else (letter in "[{") - (letter in "]}")
+        if letter == "," and not depth and not inside:
+            items.append("")
+        else:
+            items[-1] += letter
+    items = [item.strip() for item in items]
+    return "[" + ",".join(item if not item or item[0] in "'\"" else quote(item) for item in items) + "]"

@@ -1,0 +1,263 @@
+"""`snarf reproduce`: the papers' tables and figures, from training to the report, in one command."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING
+
+from snarfcli.checks import check_choice, check_number
+from snarfcli.commands.train import TrainConfig
+from snarfcli.errors import UserError
+from snarfcli.reproduce.jobs import Status
+from snarfcli.reproduce.launching import LAUNCHERS, Launcher, check_launcher, launch
+from snarfcli.reproduce.plans import Choice, Job, Plan, choose_experiments, make_plan, unique_jobs
+from snarfcli.reproduce.report import write_report
+from snarfcli.reproduce.results import Result, collect
+from snarfcli.reproduce.tables import plain_table
+from snarfcli.runs import choose_device
+from snarfcli.settings import check_overrides, config_folder, preset_groups
+
+__all__ = ["ReproduceConfig", "resolve_training", "run"]
+
+log = logging.getLogger(__name__)
+
+# The avatar is the same whatever these are, or they name the run.
+_NOT_OF_THE_AVATAR = ("subject", "seed", "run", "data_root", "output_root", "resume", "overwrite", "device", "threads")
+
+
+@dataclass
+class ReproduceConfig:
+    """Settings of `snarf reproduce`."""
+
+    what: str | None = MISSING
+    """table1, table2, ablations, stick2d, clothed or all; may be given without its name."""
+    subjects: list[str] = MISSING
+    """Subjects; empty: 50002 and 50004 of the built-in set, all ten of DFaust."""
+    seeds: list[int] = MISSING
+    """Seeds; with several the tables have standard deviations."""
+    training: str | None = MISSING
+    """Training preset of all systems; null: quick, and stick2d for the 2D stick."""
+    data: str | None = MISSING
+    """Data set; null: builtin, stick2d or clothed. Licensed ones: dfaust (with PosePrior), cape for the clothed experiment."""
+    systems: list[str] = MISSING
+    """Rows of the table to make; empty: all."""
+    extra: list[str] = MISSING
+    """Further settings of every training, such as [training.steps=1000]; such runs have folders of their own."""
+    data_root: str = MISSING
+    """Folder with the processed samples; missing ones are made."""
+    output_root: str = MISSING
+    """Folder for results; the runs go to <output_root>/<data>/<subject>/<row>-<training>-s<seed>."""
+    report: str | None = MISSING
+    """Folder for the tables and figures; null: <output_root>/reproduce/<what>."""
+    launcher: str = MISSING
+    """basic (one after the other), joblib, submitit_local or submitit_slurm."""
+    processes: int = MISSING
+    """Jobs at a time; on a cluster at most."""
+    launcher_settings: list[str] = MISSING
+    """Settings of Hydra's launcher, such as [partition=gpu,gpus_per_node=1]."""
+    threads: int | None = MISSING
+    """Threads of each job; null: the cores shared among the processes."""
+    device: str = MISSING
+    """auto, cpu, cuda or cuda:N."""
+    max_frames: int | None = MISSING
+    """Evaluate so many frames; null for all."""
+    surface_frames: int = MISSING
+    """In so many frames surfaces are extracted and compared too (Chamfer distance, normals, F-score)."""
+    figures: bool = MISSING
+    """Whether to draw figures."""
+    figure_resolution: int = MISSING
+    """Voxels along the longest side of the meshes in the figures."""
+    only_report: bool = MISSING
+    """Run nothing; write tables and figures from what is there."""
+    dry_run: bool = MISSING
+    """Print what would be run and stop."""
+
+
+def run(config: ReproduceConfig) -> int:
+    """Make what is missing and write a report for each experiment; return 1 if a run failed, which the tables show.
+
+    Raises:
+        UserError: something chosen is unknown or cannot be used; nothing has been run.
+        OSError: a folder cannot be written to, or the disk is full.
+    """
+    launcher = _check(config)
+    choice = Choice(
+        subjects=tuple(config.subjects), seeds=tuple(config.seeds), training=config.training, data=config.data,
+        systems=tuple(config.systems), extra=tuple(config.extra), data_root=config.data_root,
+        output_root=config.output_root, threads=launcher.threads, device=config.device, max_frames=config.max_frames,
+        surface_frames=config.surface_frames,
+    )  # fmt: skip
+    plans = [make_plan(one, part, resolve_training) for one, part in choose_experiments(config.what, choice)]
+    jobs = unique_jobs(plans)
+    if config.dry_run:
+        _print_plan(jobs)
+        return 0
+    folders = [_report_folder(config, plan) for plan in plans]
+    for folder in folders:
+        folder.mkdir(parents=True, exist_ok=True)  # found out before the work that it cannot be written to
+    if not config.only_report:
+        log.info("%d runs, launcher %s, %d at a time", len(jobs), launcher.name, launcher.processes)
+        progress = _Progress(jobs, launcher.processes)
+        try:
+            launch(jobs, Path(config.output_root) / "reproduce" / "jobs", launcher, progress)
+        except KeyboardInterrupt:
+            log.info("stopped with %d of %d runs done; the same command goes on from there", progress.done, len(jobs))
+            raise
+    results: list[Result] = []
+    for plan, folder in zip(plans, folders, strict=True):
+        of_plan = [collect(job) for job in plan.jobs]
+        results += of_plan
+        log.info("\n%s\n\n%s\n", plan.experiment.title, plain_table(plan, of_plan))
+        resolution = config.figure_resolution if config.figures else None
+        about = f"{launcher.processes} runs at a time" if launcher.processes > 1 else ""
+        for path in write_report(plan, of_plan, folder, _command(config), about=about, figure_resolution=resolution):
+            log.info("written: %s", path)
+    return 0 if all(result.state == "done" for result in results) else 1
+
+
+def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
+    """Return the configuration of `snarf train` under overrides, without what the avatar does not depend on.
+
+    Raises:
+        UserError: an override names no setting, or no option.
+    """
+    from hydra import compose, initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from omegaconf import OmegaConf
+
+    from snarfcli.cli import register_schemas
+
+    check_overrides(overrides, TrainConfig, "train")
+    presets = preset_groups(TrainConfig, "train")
+    named = [override.partition("=") for override in overrides]
+    overrides = [f"{presets.get(name, name)}={value}" for name, _, value in named]
+    register_schemas("train", TrainConfig)
+    running = GlobalHydra.instance().hydra  # of this command itself: there can only be one
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(config_folder().absolute()), version_base="1.3"):
+            config = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
+    finally:
+        GlobalHydra.instance().clear()
+        if running is not None:
+            GlobalHydra.instance().initialize(running)
+    for name in _NOT_OF_THE_AVATAR:
+        config.pop(name)
+    config["training"].pop("workers", None)
+    return config
+
+
+def _check(config: ReproduceConfig) -> Launcher:
+    """Refuse settings that cannot be used, before any work starts; return how jobs are distributed."""
+    check_choice("launcher", config.launcher, LAUNCHERS)
+    for name, least in {"processes": 1, "threads": 1, "max_frames": 1, "surface_frames": 0, "figure_resolution": 16}.items():
+        check_number(name, getattr(config, name), least)
+    for one in config.launcher_settings:
+        if "=" not in one:
+            raise UserError(f"launcher_settings: wanted settings such as [partition=gpu], got '{one}'")
+    if config.launcher != "submitit_slurm":  # there the job's machine may have what this one has not
+        choose_device(config.device)
+    threads = config.threads
+    if threads is None and config.launcher in ("joblib", "submitit_local"):
+        threads = max(1, _cores() // config.processes)
+    launcher = Launcher(config.launcher, config.processes, threads, tuple(config.launcher_settings))
+    if not (config.dry_run or config.only_report):
+        check_launcher(launcher)
+    return launcher
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _report_folder(config: ReproduceConfig, plan: Plan) -> Path:
+    name = plan.experiment.name
+    if config.report is None:
+        return Path(config.output_root) / "reproduce" / name
+    return Path(config.report) / name if config.what == "all" else Path(config.report)
+
+
+def _print_plan(jobs: Sequence[Job]) -> None:
+    """Print each run and the commands that make it."""
+    made: set[str] = set()
+    for number, job in enumerate(jobs, 1):
+        log.info("run %d of %d: %s, %s", number, len(jobs), job.name, job.folder)
+        for samples in job.samples:
+            if samples.folder not in made and not (Path(samples.folder) / "manifest.json").exists():
+                log.info("  snarf %s", " ".join(samples.arguments))
+            made.add(samples.folder)
+        for arguments in (job.train, *(evaluation.arguments for evaluation in job.evaluations)):
+            log.info("  snarf %s", " ".join(arguments))
+
+
+def _command(config: ReproduceConfig) -> str:
+    """Return the command: what differs from the defaults."""
+    import shlex
+
+    from omegaconf import OmegaConf
+
+    defaults = OmegaConf.to_container(OmegaConf.load(config_folder() / "reproduce" / "reproduce.yaml"))
+    words = ["snarf", "reproduce", str(config.what)]
+    for name, value in asdict(config).items():
+        if name != "what" and value != defaults[name]:
+            word = f"{name}={_written(value)}"
+            words.append(word if re.fullmatch(r"[\w.,=/:+\-\[\]]*", word) else shlex.quote(word))
+    return " ".join(words)
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ",".join(map(str, value)) + "]"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+class _Progress:
+    """A line when a run starts and one when it ends."""
+
+    def __init__(self, jobs: Sequence[Job], processes: int) -> None:
+        self.jobs, self.processes = jobs, processes
+        self.start = time.monotonic()
+        self.done = 0
+        self._ended: set[int] = set()
+        self._worked_s: list[float] = []
+
+    def __call__(self, number: int, status: Status) -> None:
+        job = self.jobs[number]
+        if status.state == "running":
+            log.info("started: %s (%s)", job.name, Path(job.folder) / "reproduce.log")
+            return
+        if status.state == "stopped":
+            return
+        self._ended.add(number)
+        self.done += status.state == "done"
+        seconds = sum(status.seconds.values())
+        if seconds:
+            self._worked_s.append(seconds)
+        log.info("%d of %d: %s: %s%s", len(self._ended), len(self.jobs), job.name, self._outcome(job, status), self._left())
+
+    def _outcome(self, job: Job, status: Status) -> str:
+        if status.state != "done":
+            return f"{status.state} ({status.stage}: {status.reason})" if status.reason else status.state
+        values = collect(job).values
+        parts = [
+            f"{name} " + "/".join(f"{values[key]:.1f}" if key in values else "-" for key in (f"{name}_id", f"{name}_ood"))
+            for name in ("bbox", "surface")
+        ]
+        seconds = sum(status.seconds.values())
+        return ", ".join([*parts, "IoU in/out of distribution", f"{seconds:.0f} s" if seconds else "was there already"])
+
+    def _left(self) -> str:
+        """Return about how long the rest takes, by the mean of the runs that took time."""
+        left = len(self.jobs) - len(self._ended)
+        if not left or not self._worked_s:
+            return ""
+        seconds = sum(self._worked_s) / len(self._worked_s) * left / min(self.processes, left)
+        return f"; about {seconds / 60:.0f} min left" if seconds >= 60 else f"; about {seconds:.0f} s left"

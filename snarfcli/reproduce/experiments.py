@@ -1,0 +1,175 @@
+"""The experiments of the papers: which systems each compares, with which settings, on which data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+__all__ = ["EXPERIMENTS", "Experiment", "Row"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One system of a table."""
+
+    key: str
+    """Its name: of the row in `systems=`, and first part of the names of its runs. One key stands for one set of overrides."""
+    label: str
+    """What the table calls it."""
+    overrides: tuple[str, ...] = ()
+    """Settings of `snarf train` that make it."""
+    paper: str | None = None
+    """Its name in `papers.yaml`, where the papers report it."""
+    inside_test: str = "winding"
+    """How the training samples are labelled; the evaluation's always by winding number."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One table with its figures."""
+
+    name: str
+    """What `snarf reproduce` calls it."""
+    title: str
+    """Heading of the report."""
+    rows: tuple[Row, ...]
+    """Systems, in the order of the table."""
+    data: tuple[str, ...]
+    """Data sets that it can be made on; the first is the default."""
+    subjects: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Subjects by data set, where none are named."""
+    training: str = "quick"
+    """Training preset, where none is named."""
+    order: tuple[str, ...] = ()
+    """Keys of rows from the best to the worst out of distribution, as the papers have it."""
+    notes: tuple[str, ...] = ()
+    """What a reader must know."""
+
+
+_DFAUST = ("50002", "50004", "50007", "50009", "50020", "50021", "50022", "50025", "50026", "50027")
+_BODIES = ("builtin", "dfaust")
+_BODY_SUBJECTS = {"builtin": ("50002", "50004"), "dfaust": _DFAUST}
+
+# The papers' systems see the whole pose, whatever the default of `condition` is.
+_PAPERS = ("condition=global",)
+_BROYDEN = ("model=fast_snarf", "search=broyden", "search.jacobian=broyden", *_PAPERS)
+_OURS = ("model=fast_snarf", "search=complete")
+
+_POSE_ONET = Row("pose_onet", "Pose-ONet", ("model=pose_onet", *_PAPERS), "pose_onet")
+_BACK_D = Row("back_d", "Back-D", ("model=back_d", *_PAPERS), "back_d")
+_BACK_LBS = Row("back_lbs", "Back-LBS", ("model=back_lbs", *_PAPERS), "back_lbs")
+_NASA = Row("nasa", "NASA", ("model=nasa", *_PAPERS), "nasa")
+_SNARF = Row("snarf", "SNARF", ("model=snarf", *_PAPERS), "snarf")
+_FAST_SNARF = Row("fast_snarf-broyden", "Fast-SNARF", _BROYDEN, "fast_snarf")
+_GLOBAL = Row("ours-global", "ours, condition=global", (*_OURS, "condition=global"))
+_LOCAL = Row("ours-local", "ours, condition=local", (*_OURS, "condition=local"))
+_NONE = Row("ours-none", "ours, condition=none", (*_OURS, "condition=none"))
+
+
+def _grid(key: str, resolution: tuple[int, int, int], paper: str) -> Row:
+    sides = ",".join(map(str, resolution))
+    return Row(key, " x ".join(map(str, resolution)), (*_BROYDEN, f"skinning.resolution=[{sides}]"), paper)
+
+
+def _changed(key: str, label: str, *overrides: str, inside_test: str = "winding") -> Row:
+    """Return a row that differs from `_GLOBAL` in one thing."""
+    return Row(key, label, (*_OURS, "condition=global", *overrides), inside_test=inside_test)
+
+
+_TABLE1 = Experiment(
+    "table1",
+    "Minimally clothed humans (SNARF Table 1, Fast-SNARF Table 1)",
+    (_POSE_ONET, _BACK_D, _BACK_LBS, _NASA, _SNARF, _FAST_SNARF, _GLOBAL, _LOCAL),
+    _BODIES,
+    _BODY_SUBJECTS,
+    order=("ours-local", "ours-global", "fast_snarf-broyden", "snarf", "nasa", "back_lbs", "back_d", "pose_onet"),
+)
+
+_TABLE2 = Experiment(
+    "table2",
+    "Learning strategies and grids of the skinning weights (Fast-SNARF Table 2)",
+    (
+        _SNARF,
+        Row("fast_snarf-broyden", "Fast-SNARF, grid of the preset", _BROYDEN, "fast_snarf"),
+        Row("voxel", "w/o MLP distillation, 64 x 64 x 16",
+            (*_BROYDEN, "skinning=voxel", "skinning.resolution=[64,64,16]"), "voxel"),
+        _grid("grid16", (16, 16, 4), "grid16"),
+        _grid("grid32", (32, 32, 8), "grid32"),
+        _grid("grid64", (64, 64, 16), "grid64"),
+        _grid("grid128", (128, 128, 32), "grid128"),
+    ),
+    _BODIES,
+    _BODY_SUBJECTS,
+    notes=("All but SNARF search from nine bones by Broyden's method, as in the paper.",),
+)  # fmt: skip
+
+_RECIPE = (
+    "model.blend=probability", "model.blend_sharpness=5", "training.uniform_points=267", "training.surface_points=2133",
+    "training.far_points=0", "training.learning_rate=1.0e-3", "training.final_learning_rate=1.0", "training.average_decay=0.0",
+    "training.bone_occupancy_weight=1.0", "skinning.prior_falloff_m=null", "skinning.sharpness=20", "shape.prior_radius_m=null",
+    "shape.geometric_init=true",
+)  # fmt: skip
+
+_ABLATIONS = Experiment(
+    "ablations",
+    "One thing changed at a time",
+    (
+        Row("ours-global", "base: complete search, exact Jacobian, condition=global", _GLOBAL.overrides),
+        Row("broyden9", "search from 9 bones, exact Jacobian",
+            ("model=fast_snarf", "search=broyden", "search.jacobian=exact", *_PAPERS)),
+        Row("fast_snarf-broyden", "search from 9 bones, Broyden's Jacobian", _BROYDEN),
+        Row("broyden24", "search from all bones, exact Jacobian",
+            ("model=fast_snarf", "search=broyden", "search.init_bones=null", "search.jacobian=exact", *_PAPERS)),
+        _changed("oriented", "orientation-preserving roots only", "search.orientation_preserving=true"),
+        _changed("all_cells", "every cell active", "skinning.bone_radius_m=null", "training.refresh_cells_every=0"),
+        _changed("parity", "labels by ray parity", inside_test="parity"),
+        _LOCAL,
+        _NONE,
+        _changed("target_parent", "joint target: parent (F)", "training.joint_target=parent"),
+        _changed("target_own", "joint target: own (released code)", "training.joint_target=own"),
+        Row("papers_recipe", "the papers' recipe in the preset's networks", (*_BROYDEN, *_RECIPE)),
+    ),
+    _BODIES,
+    _BODY_SUBJECTS,
+    notes=(
+        "Every row differs from the base in what its label says, and in nothing else; the papers' recipe takes their search, "
+        "sampling, blend, learning rate and starting point at once.",
+        "All are evaluated on labels by winding number.",
+    ),
+)  # fmt: skip
+
+# S Sec. 4.3: "we do not use local pose-conditioning as the shape does not locally deform with pose". Pose-ONet and the weights
+# of Back-LBS depend on the pose all the same.
+_STICK2D = Experiment(
+    "stick2d",
+    "2D stick (SNARF Sec. 4.3, Fig. 4 and 5)",
+    (
+        Row("ours-none", "forward skinning (ours)", (*_OURS, "condition=none")),
+        Row("back_lbs", "Back-LBS", ("model=back_lbs", "condition=none")),
+        Row("pose_onet", "Pose-ONet", ("model=pose_onet", "condition=none")),
+        Row("piecewise", "Piecewise", ("model=piecewise", "condition=none")),
+    ),
+    ("stick2d",),
+    {"stick2d": ("stick", "stick_object", "stick_step10", "stick_step20", "stick_step30", "stick_step60")},
+    training="stick2d",
+    order=("ours-none", "back_lbs", "pose_onet"),
+    notes=(
+        "stick: two bones; stick_object: a rigid object besides; stick_stepN: two bones, training angles N degrees apart.",
+        "In distribution: angles as in training, out of distribution: larger ones.",
+    ),
+)
+
+_CLOTHED_SETTINGS = ("experiment=cape",)
+_CLOTHED = Experiment(
+    "clothed",
+    "Clothed humans (SNARF Sec. 4.5, Fast-SNARF Sec. 5.2)",
+    tuple(
+        Row(row.key, row.label, (*_CLOTHED_SETTINGS, *row.overrides))
+        for row in (Row("smpl_nn", "SMPL NN", ("model=smpl_nn", *_PAPERS)), _SNARF, _FAST_SNARF, _GLOBAL, _LOCAL)
+    ),
+    ("clothed", "cape"),
+    {"clothed": ("50002", "50004")},
+    notes=("The papers show pictures of this experiment and no numbers.",),
+)
+
+EXPERIMENTS = {experiment.name: experiment for experiment in (_TABLE1, _TABLE2, _ABLATIONS, _STICK2D, _CLOTHED)}
+"""All experiments by name."""

@@ -1,0 +1,178 @@
+"""The figures of a report: systems beside the truth, their skinning weights in colour, and curves."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from snarfcli.datasets.store import SampleStore
+from snarfcli.errors import UserError
+from snarfcli.evaluation.evaluate import Samples, choose_frames
+from snarfcli.export import Camera, contact_sheet, render, weights_to_colors, write_png
+from snarfcli.files import atomic_path, read_json
+from snarfcli.meshing.mesh import Mesh
+from snarfcli.meshing.surfaces import canonical_surface, field_surface
+from snarfcli.models.avatar import Avatar
+from snarfcli.progress import progress
+from snarfcli.reproduce.curves import line_chart
+from snarfcli.reproduce.experiments import Row
+from snarfcli.reproduce.plans import Plan
+from snarfcli.reproduce.results import Result
+
+__all__ = ["draw_sequences", "draw_systems", "draw_weights"]
+
+log = logging.getLogger(__name__)
+
+_PANEL = 256
+_FRAMES = {"id": 2, "ood": 4}
+_SEEN_FROM_RAD = 0.35  # a body in its canonical pose, nearly from the front
+
+
+def draw_systems(plan: Plan, results: Sequence[Result], folder: Path, resolution: int) -> tuple[Path, str] | None:
+    """Draw frames in and out of distribution, a row each: the truth, then what each system makes of it (S Fig. 6, F Fig. 5).
+
+    Args:
+        plan: what was run.
+        results: its runs; of every system the first trained one is drawn, of the first subject that has any.
+        folder: for the picture.
+        resolution: voxels along the longest side of the meshes.
+
+    Returns:
+        The file and its caption; None if there is nothing to draw.
+    """
+    shown = _trained(plan, results)
+    if not shown:
+        return None
+    first = shown[0][1]
+    frames = [(split, *frame) for split, count in _FRAMES.items() for frame in _frames(first, split, count)]
+    if not frames:
+        return None
+    rows: list[list[np.ndarray | None]] = [[] for _ in frames]
+    truths = [Mesh(sequence.vertices(index), sequence.faces(index)) for _, sequence, index in frames]
+    cameras = [Camera.framing(truth.vertices) for truth in truths]
+    for row, truth, camera in zip(rows, truths, cameras, strict=True):
+        row.append(render(truth, camera, _PANEL))
+    for _, result in progress(shown, desc="drawing systems", unit="systems"):
+        avatar = Avatar.load(result.job.folder)
+        for row, truth, camera, (_, sequence, index) in zip(rows, truths, cameras, frames, strict=True):
+            mesh = _predicted(avatar, sequence, index, resolution)
+            floor_y = float(truth.vertices[:, 1].min())
+            row.append(None if mesh is None else render(mesh, camera, _PANEL, floor_y=floor_y))
+    where = {"id": "in distribution", "ood": "out of distribution"}
+    sheet = contact_sheet(
+        rows,
+        row_labels=[f"{where[split]}: {sequence.name}, frame {sequence.frame_numbers[i]}" for split, sequence, i in frames],
+        column_labels=["ground truth", *(row.label for row, _ in shown)],
+    )
+    path = folder / "systems.png"
+    write_png(path, sheet)
+    seed = first.job.seed
+    return path, f"Frames in and out of distribution, subject {first.job.subject}, seed {seed}; empty: the field has no surface"
+
+
+def draw_weights(plan: Plan, results: Sequence[Result], folder: Path, resolution: int) -> tuple[Path, str] | None:
+    """Draw canonical surfaces coloured by their skinning weights, those that the data was made with first (F Fig. 6).
+
+    Arguments and result: as `draw_systems`. Systems without weights of canonical points are left out.
+    """
+    shown = _trained(plan, results)
+    pictures: list[np.ndarray] = []
+    labels: list[str] = []
+    if not shown:
+        return None
+    template = _store(shown[0][1], "id").template
+    camera = None
+    if template is not None:
+        camera = Camera.framing(template.vertices, azimuth_rad=_SEEN_FROM_RAD)
+        truth = Mesh(template.vertices, template.faces, colors=weights_to_colors(template.weights))
+        pictures.append(render(truth, camera, _PANEL))
+        labels.append("the body's own")
+    for row, result in shown:
+        avatar = Avatar.load(result.job.folder)
+        if not (avatar.model.has_skinning_weights and avatar.model.has_canonical_shape):
+            continue
+        try:
+            mesh = canonical_surface(avatar, avatar.skeleton.canonical_pose.float(), resolution)
+        except ValueError as error:
+            log.warning("warning: no weights to draw of %s: %s", row.label, error)
+            continue
+        camera = camera or Camera.framing(mesh.vertices, azimuth_rad=_SEEN_FROM_RAD)
+        pictures.append(render(replace(mesh, colors=weights_to_colors(mesh.weights)), camera, _PANEL))
+        labels.append(row.label)
+    if not pictures:
+        return None
+    path = folder / "weights.png"
+    write_png(path, contact_sheet([pictures], column_labels=labels))
+    return path, f"Skinning weights, a colour for each bone, subject {shown[0][1].job.subject}, seed {shown[0][1].job.seed}"
+
+
+def draw_sequences(plan: Plan, results: Sequence[Result], folder: Path) -> tuple[Path, str] | None:
+    """Draw the surface IoU of every out-of-distribution sequence, the mean over runs, a line for each system.
+
+    Arguments and result: as `draw_systems`. Only whole rows are drawn: the mean of some runs of another would mislead.
+    """
+    lines: dict[str, dict[str, float]] = {}
+    for row in plan.experiment.rows:
+        of_row = [result for result in results if result.job.row == row.key]
+        if not of_row or not all("ood" in result.files for result in of_row):
+            continue
+        values: dict[str, list[float]] = {}
+        for result in of_row:
+            for name, sequence in read_json(result.files["ood"], "metrics").get("sequences", {}).items():
+                values.setdefault(name, []).append(100 * sequence["iou_surface"])
+        lines[row.label] = {name: float(np.mean(some)) for name, some in values.items()}
+    names = sorted({name for line in lines.values() for name in line})
+    if len(names) < 2:
+        return None
+    # from the easiest to the hardest, by the mean of all systems
+    names.sort(key=lambda name: -np.mean([line[name] for line in lines.values() if name in line]))
+    series = {label: [line.get(name) for name in names] for label, line in lines.items()}
+    path = folder / "sequences.svg"
+    with atomic_path(path) as temporary:
+        temporary.write_text(line_chart(names, series, y_label="surface IoU, %"))
+    return path, "Surface IoU of each out-of-distribution sequence, mean over subjects and seeds"
+
+
+def _trained(plan: Plan, results: Sequence[Result]) -> list[tuple[Row, Result]]:
+    """Return rows and a trained run of each, all of the subject and seed that the most rows have."""
+    trained = [result for result in results if "train" in result.files]
+    if not trained:
+        return []
+    counts: dict[tuple[str, int], int] = {}
+    for result in trained:
+        key = (result.job.subject, result.job.seed)
+        counts[key] = counts.get(key, 0) + 1
+    chosen = max(counts, key=lambda key: counts[key])  # the first of several equals
+    of_row = {result.job.row: result for result in trained if (result.job.subject, result.job.seed) == chosen}
+    return [(row, of_row[row.key]) for row in plan.experiment.rows if row.key in of_row]
+
+
+def _store(result: Result, split: str) -> SampleStore:
+    """Return the samples that a split of a run is evaluated on."""
+    evaluation = next(one for one in result.job.evaluations if one.split == split)
+    return SampleStore.open(evaluation.data_root, evaluation.data, result.job.subject)
+
+
+def _frames(result: Result, split: str, count: int) -> Iterator[tuple[Samples, int]]:
+    """Yield frames of a split, evenly spaced over its sequences; none if the data has no such split."""
+    try:
+        sequences = _store(result, split).sequences("test" if split == "id" else "ood")
+    except UserError:
+        return
+    yield from choose_frames(sequences, count)
+
+
+def _predicted(avatar: Avatar, sequence: Samples, index: int, resolution: int) -> Mesh | None:
+    pose, translation, transforms = (
+        torch.as_tensor(values[index]) for values in (sequence.poses, sequence.translation, sequence.bone_transforms)
+    )
+    try:
+        return field_surface(avatar, pose, translation, resolution, transforms=transforms)
+    except ValueError as error:
+        log.warning("warning: no surface of %s, frame %d: %s", sequence.name, sequence.frame_numbers[index], error)
+        return None

@@ -1,0 +1,219 @@
+"""Running the jobs of a plan side by side, through Hydra's launchers, and watching what becomes of them.
+
+DESIGN. The plan is a file. `snarf reproduce_job -m job=0,1,2 hydra/launcher=...` in a process of its own hands its jobs to the
+launcher; every job writes what becomes of it beside the plan, on a disk that all see, and looks there whether it should stop.
+So a job may run in this process's child, in a worker of joblib or on another machine of a cluster, and Ctrl-C reaches them all:
+each lets its command write a checkpoint and ends.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from snarfcli.errors import UserError
+from snarfcli.files import read_json, write_json
+from snarfcli.reproduce.jobs import Status, run_job
+from snarfcli.reproduce.locks import one_of
+from snarfcli.reproduce.plans import Job
+from snarfcli.settings import quote
+
+__all__ = ["LAUNCHERS", "Launcher", "check_launcher", "launch", "run_planned_job"]
+
+LAUNCHERS = ("basic", "joblib", "submitit_local", "submitit_slurm")
+"""What can distribute jobs: one after the other, processes of this machine, submitit's on this machine or a cluster."""
+
+_PACKAGES = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit"}
+_LOOK_EVERY_S = 0.5
+_LONGEST_MIN = 7 * 24 * 60  # submitit's own limit is an hour
+
+
+@dataclass(frozen=True)
+class Launcher:
+    """How jobs are distributed."""
+
+    name: str = "basic"
+    """One of `LAUNCHERS`."""
+    processes: int = 1
+    """Jobs at a time; on a cluster at most."""
+    threads: int | None = None
+    """Threads of each, which a cluster is asked for."""
+    settings: tuple[str, ...] = ()
+    """Further settings of Hydra's launcher, such as partition=gpu."""
+
+
+def check_launcher(launcher: Launcher) -> None:
+    """Refuse a launcher that is not installed, before any work.
+
+    Raises:
+        UserError: it is not, or more than one process is wanted from one that has one.
+    """
+    package = _PACKAGES.get(launcher.name)
+    if package and importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher") is None:
+        raise UserError(
+            f"launcher={launcher.name} needs hydra-{package}-launcher; install it with: pip install 'snarf[{package}]' "
+            f"(or pip install hydra-{package}-launcher)"
+        )
+    if launcher.name == "basic" and launcher.processes > 1:
+        raise UserError(f"launcher=basic runs one job at a time, got processes={launcher.processes}; give launcher=joblib too")
+
+
+def launch(
+    jobs: Sequence[Job], folder: Path, launcher: Launcher, on_change: Callable[[int, Status], None]
+) -> list[Status | None]:
+    """Run jobs and return what became of each; None for one that the launcher never came to.
+
+    Ctrl-C (or a signal to end) lets every running command write its checkpoint; a second one ends all at once.
+
+    Args:
+        jobs: what to run.
+        folder: for the plan, and for what the launcher writes.
+        launcher: how.
+        on_change: called with the number of a job and its status when it starts and when it ends.
+
+    Raises:
+        UserError: the launcher could not start at all.
+        KeyboardInterrupt: interrupted; everything has ended.
+    """
+    work = folder / secrets.token_hex(4)
+    work.mkdir(parents=True)
+    write_json(work / "plan.json", {"slots": _slots(launcher), "jobs": [asdict(job) for job in jobs]})
+    log = work / "launcher.log"
+    with log.open("w") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "snarfcli", *_arguments(work, len(jobs), launcher)],
+            stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
+    seen: dict[int, Status] = {}
+
+    def look() -> None:
+        for number in range(len(jobs)):
+            if number not in seen or seen[number].state == "running":
+                status = _read(work / f"{number}.json")
+                if status is not None and status != seen.get(number):
+                    seen[number] = status
+                    on_change(number, status)
+
+    with _signals_as_interrupt():
+        try:
+            while process.poll() is None:
+                look()
+                time.sleep(_LOOK_EVERY_S)
+        except KeyboardInterrupt:
+            _stop(process, work)
+            look()
+            raise
+    look()
+    if not seen:
+        lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+        raise UserError(f"launcher={launcher.name} started no job: {lines[-1] if lines else 'it said nothing'}; see {log}")
+    return [seen.get(number) for number in range(len(jobs))]
+
+
+def run_planned_job(plan: Path, number: int) -> None:
+    """Run one job of the plan in a file and write beside it what became of it.
+
+    Raises:
+        UserError: there is no such plan or job.
+    """
+    content = read_json(plan, "plan")
+    try:
+        job = Job.from_dict(content["jobs"][number])
+        slots = content["slots"]
+    except (KeyError, IndexError, TypeError):
+        raise UserError(f"plan {plan} has no job {number}; it is written by snarf reproduce") from None
+    result, stop = plan.with_name(f"{number}.json"), plan.with_name("stop")
+
+    def begin() -> Status:
+        if not stop.exists():
+            write_json(result, asdict(Status("running", job.digest)))
+        return run_job(job, stopped=stop.exists)
+
+    try:
+        if slots is None:
+            status = begin()
+        else:
+            with one_of([plan.with_name(f"slot{slot}") for slot in range(slots)]):
+                status = begin()
+    except Exception as error:  # a fault of the program or a full disk: one job's, not of those after it
+        status = Status("failed", job.digest, stage="reproduce", reason=" ".join(f"{type(error).__name__}: {error}".split()))
+    write_json(result, asdict(status))
+
+
+def _arguments(work: Path, count: int, launcher: Launcher) -> list[str]:
+    """Return the arguments of `snarf` that hand the jobs to Hydra's launcher."""
+    arguments = ["reproduce_job", f"plan={quote(str(work / 'plan.json'))}", f"job={','.join(map(str, range(count)))}"]
+    arguments += ["-m"] if count > 1 or launcher.name != "basic" else []
+    settings = {"hydra.sweep.dir": quote(str(work / "launcher"))}
+    if launcher.name != "basic":
+        arguments.append(f"hydra/launcher={launcher.name}")
+    if launcher.name == "joblib":
+        settings |= {"hydra.launcher.n_jobs": str(launcher.processes)}
+    if launcher.name.startswith("submitit"):
+        settings |= {"hydra.launcher.timeout_min": str(_LONGEST_MIN)}
+        if launcher.threads:
+            settings["hydra.launcher.cpus_per_task"] = str(launcher.threads)
+    if launcher.name == "submitit_slurm":
+        settings["hydra.launcher.array_parallelism"] = str(launcher.processes)
+    settings |= {f"hydra.launcher.{name}": value for name, _, value in (one.partition("=") for one in launcher.settings)}
+    return arguments + [f"{name}={value}" for name, value in settings.items()]
+
+
+def _slots(launcher: Launcher) -> int | None:
+    """Return how many jobs may work at once where the launcher itself starts all of them."""
+    return launcher.processes if launcher.name == "submitit_local" else None
+
+
+def _read(path: Path) -> Status | None:
+    try:
+        return Status(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def _stop(process: subprocess.Popen[Any], work: Path) -> None:
+    """Ask all jobs to end and wait for it; on a second Ctrl-C end them."""
+    (work / "stop").touch()
+    try:
+        process.wait()
+    except KeyboardInterrupt:
+        if os.name == "posix":
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+        process.wait()
+
+
+@contextmanager
+def _signals_as_interrupt() -> Iterator[None]:
+    """Take requests to end for Ctrl-C, unless whoever started us has them ignored, as nohup does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [getattr(signal, name) for name in names]
+    before = {number: signal.getsignal(number) for number in numbers}
+    for number in numbers:
+        if before[number] is not signal.SIG_IGN:
+            signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

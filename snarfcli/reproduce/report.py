@@ -1,0 +1,193 @@
+"""The report of an experiment: tables, figures, and how they came about, in a folder that can be kept on its own."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import snarfcli
+from snarfcli.errors import UserError
+from snarfcli.files import atomic_path, read_json, write_json
+from snarfcli.reproduce.papers import paper_source
+from snarfcli.reproduce.plans import Plan
+from snarfcli.reproduce.results import COLUMNS, Result
+from snarfcli.reproduce.tables import csv_table, markdown_runs, markdown_table, more_columns, order_lines
+
+__all__ = ["write_report"]
+
+log = logging.getLogger(__name__)
+
+_LARGEST_COPY_BYTES = 30_000
+_COPIES = {"train": "train.json", "id": "eval_id.json", "ood": "eval_ood.json"}
+_DRAWN = {"table1": ("systems", "weights"), "table2": ("weights",), "ablations": (), "clothed": ("systems",)}
+
+
+def write_report(
+    plan: Plan,
+    results: Sequence[Result],
+    folder: Path,
+    command: str,
+    *,
+    about: str = "",
+    figure_resolution: int | None = None,
+) -> list[Path]:
+    """Write `<experiment>.md`, `<experiment>.csv`, `figures/` and `runs/`, the files behind the numbers, into a folder.
+
+    Args:
+        plan: what was run.
+        results: of all its jobs, in their order.
+        folder: the report's; links are relative to it, so that it may be moved.
+        command: that made it.
+        about: what else a reader must know of how it was run.
+        figure_resolution: voxels along the longest side of drawn meshes; None draws nothing.
+
+    Returns:
+        The written tables and figures.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    copies = {id(result): _copy(result, folder) for result in results}
+
+    def link(result: Result, stage: str) -> str | None:
+        return copies[id(result)].get(stage)
+
+    name = plan.experiment.name
+    table = folder / f"{name}.csv"
+    with atomic_path(table) as temporary:
+        temporary.write_text(csv_table(plan, results, link))
+    figures = [] if figure_resolution is None else _figures(plan, results, folder / "figures", figure_resolution)
+    text = folder / f"{name}.md"
+    sections = [
+        _head(plan, results, command, about),
+        _tables(plan, results, link),
+        _figures_text(figures, folder),
+        f"## Runs\n\nEvery number links to the file that it is from.\n\n{markdown_runs(plan, results, link)}",
+    ]
+    with atomic_path(text) as temporary:
+        temporary.write_text("\n\n".join(section for section in sections if section) + "\n")
+    return [text, table, *(path for path, _ in figures)]
+
+
+def _head(plan: Plan, results: Sequence[Result], command: str, about: str) -> str:
+    """Return title, command, machine, settings and what the columns are."""
+    experiment = plan.experiment
+    settings = ", ".join(f"{key} {_plain(value)}" for key, value in plan.training_settings.items() if key != "name")
+    extra = f"; all with {', '.join(plan.extra)}" if plan.extra else ""
+    lines = [
+        f"# {experiment.title}",
+        "",
+        f"    {command}",
+        "",
+        f"- made by snarf {snarfcli.__version__} on {_machines(results)}{f', {about}' if about else ''}",
+        f"- data {plan.data}, subjects {', '.join(plan.subjects)}, seeds {', '.join(map(str, plan.seeds))}",
+        f"- training={plan.training}: {settings}{extra}; rows change of it what their runs' `config.yaml` says",
+    ]
+    lines += [f"- {note}" for note in experiment.notes]
+    source = paper_source(experiment.name)
+    if source and plan.data != "dfaust":
+        lines.append(f"- the papers' numbers ({source}) are of DFaust, PosePrior and a GPU: compare the order, not values")
+    elif source:
+        lines.append(f"- the papers' numbers: {source}, ten subjects, one Quadro RTX 6000")
+    lines += ["", "Columns:", ""]
+    lines += [f"- **{column.title}**: {column.meaning}" for column in (*COLUMNS, *more_columns(results))]
+    spread = "; ± is the standard deviation over seeds of the mean over subjects" if len(plan.seeds) > 1 else ""
+    lines += [
+        "",
+        f"Numbers are means over the seeds of each subject, then over subjects{spread}. Where a run failed, the cell "
+        "says so, and of how many runs its number is; – stands where there is nothing to measure.",
+    ]
+    return "\n".join(lines)
+
+
+def _tables(plan: Plan, results: Sequence[Result], link: Any) -> str:
+    """Return the tables, the comparison of neighbours, and the list of what went wrong."""
+    sections = []
+    several = len(plan.subjects) > 1
+    title = "## Mean over subjects" if several else f"## Subject {plan.subjects[0]}"
+    sections.append(f"{title}\n\n{markdown_table(plan, results, link, subject=None if several else plan.subjects[0])}")
+    order = order_lines(plan, results)
+    if order:
+        listed = "\n".join(f"- {line}" for line in order)
+        sections.append(f"Surface IoU out of distribution, in the order that the papers lead one to expect:\n\n{listed}")
+    more = more_columns(results)
+    if more:
+        sections.append(f"## More measures\n\n{markdown_table(plan, results, link, more)}")
+    for subject in plan.subjects if several else ():
+        sections.append(f"## Subject {subject}\n\n{markdown_table(plan, results, link, COLUMNS, subject)}")
+    broken = [result for result in results if result.state != "done"]
+    if broken:
+        listed = "\n".join(f"- {result.job.name}: {result.state}: {result.reason}" for result in broken)
+        sections.append(f"## Not done\n\n{listed}")
+    return "\n\n".join(sections)
+
+
+def _figures(plan: Plan, results: Sequence[Result], folder: Path, resolution: int) -> list[tuple[Path, str]]:
+    """Draw what belongs to the experiment; a figure that cannot be drawn is left out with a warning."""
+    from snarfcli.reproduce import figures
+
+    if plan.experiment.name == "stick2d":
+        wanted = figures.draw_stick2d(plan, results, folder)
+    else:
+        draw = {"systems": figures.draw_systems, "weights": figures.draw_weights}
+        wanted = [
+            (name, partial(draw[name], plan, results, folder, resolution)) for name in _DRAWN[plan.experiment.name]
+        ]
+        wanted.append(("sequences", partial(figures.draw_sequences, plan, results, folder)))
+    drawn = []
+    for name, make in wanted:
+        try:
+            made = make()
+        except (UserError, ValueError, OSError) as error:
+            log.warning("warning: no figure of %s: %s", name, error)
+            continue
+        if made is not None:
+            drawn.append(made)
+    return drawn
+
+
+def _figures_text(figures: Sequence[tuple[Path, str]], folder: Path) -> str:
+    if not figures:
+        return ""
+    lines = ["## Figures"]
+    for path, caption in figures:
+        lines.append(f"![{caption}]({path.relative_to(folder).as_posix()})\n\n{caption}")
+    return "\n\n".join(lines)
+
+
+def _copy(result: Result, folder: Path) -> dict[str, str]:
+    """Copy the files of a run into the report; return where they are, relative to it. Large ones lose their frames."""
+    links = {}
+    for stage, path in result.files.items():
+        relative = Path("runs") / result.job.subject / Path(result.job.folder).name / _COPIES[stage]
+        content = read_json(path, "metrics")
+        if len(json.dumps(content, indent=2)) > _LARGEST_COPY_BYTES:
+            for sequence in content.get("sequences", {}).values():
+                sequence.pop("per_frame", None)
+        write_json(folder / relative, content)
+        links[stage] = relative.as_posix()
+    return links
+
+
+def _machines(results: Sequence[Result]) -> str:
+    """Return the machines that the runs were made on, with PyTorch's version."""
+    names = {}
+    for result in results:
+        if "train" in result.files:
+            content = read_json(result.files["train"], "metrics")
+            machine, versions = content.get("machine", {}), content.get("versions", {})
+            parts = [machine.get("processor"), f"{machine.get('cores')} cores", f"{machine.get('threads')} threads a run"]
+            parts += [machine.get("gpu"), f"{machine.get('system')}, PyTorch {versions.get('torch')}"]
+            names[", ".join(str(part) for part in parts if part)] = None
+    return " and ".join(names) or "no machine yet"
+
+
+def _plain(value: Any) -> str:
+    """Return a setting as one writes it."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,204 @@
+"""What the runs of a plan measured: their files, and the numbers of the table's columns."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from snarfcli.errors import UserError
+from snarfcli.files import read_json
+from snarfcli.reproduce.jobs import Status, is_evaluated, read_status
+from snarfcli.reproduce.plans import Job
+
+__all__ = ["COLUMNS", "MORE_COLUMNS", "Cell", "Column", "Result", "collect", "summarise"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A number that every run has."""
+
+    key: str
+    """Its name in the CSV and in `papers.yaml`."""
+    title: str
+    """Its heading."""
+    meaning: str
+    """What it is."""
+    stage: str
+    """Which file has it: train, id or ood."""
+    path: tuple[str, ...]
+    """Where in the file."""
+    scale: float = 1.0
+    """From the file's unit to the table's."""
+    digits: int = 1
+    """Decimals in the table."""
+
+
+_TIMES = "time for 200,000 points, milliseconds, scaled from frames of fewer, on the machine named above"
+COLUMNS = (
+    Column("bbox_id", "bbox in", "IoU of uniform points in the papers' box, held-out motion, %", "id", ("iou_bbox",), 100),
+    Column("surface_id", "surface in", "IoU of points near the surface, held-out motion, %", "id", ("iou_surface",), 100),
+    Column("bbox_ood", "bbox out", "IoU of uniform points, out-of-distribution poses, %", "ood", ("iou_bbox",), 100),
+    Column("surface_ood", "surface out", "IoU of points near the surface, out of distribution, %", "ood",
+           ("iou_surface",), 100),
+    Column("worst_ood", "worst frame out", "lowest surface IoU of a frame out of distribution, %", "ood",
+           ("worst_iou_surface",), 100),
+    Column("search_ms", "search ms", f"going back to the canonical frame: {_TIMES}", "id", ("timings", "search_ms_per_200k")),
+    Column("shape_ms", "shape ms", f"the network: {_TIMES}", "id", ("timings", "shape_ms_per_200k")),
+    Column("total_ms", "total ms", f"everything: {_TIMES}", "id", ("timings", "total_ms_per_200k")),
+    Column("training_min", "training min", "steps times the time of a step, without validation, minutes", "train", ()),
+)  # fmt: skip
+"""The columns of every table."""
+
+MORE_COLUMNS = tuple(
+    Column(f"{key}_{split}", f"{title} {where}", f"{meaning}, {'held-out motion' if split == 'id' else 'out of distribution'}",
+           split, path, scale, digits)
+    for key, title, meaning, path, scale, digits in (
+        ("chamfer", "Chamfer mm", "mean distance between extracted and true surfaces, both ways, mm",
+         ("surfaces", "chamfer_m"), 1000, 2),
+        ("normals", "normals", "mean cosine between the normals of both surfaces", ("surfaces", "normal_consistency"), 1, 3),
+        ("f_score", "F 5 mm", "F-score at 5 mm of the extracted surface, %", ("surfaces", "f_score"), 100, 1),
+        ("lost", "lost %", "inside points without a correspondence, %", ("inside_without_correspondence",), 100, 2),
+        ("roots", "roots", "correspondences of a point that has any", ("correspondences_per_point",), 1, 2),
+    )
+    for split, where in (("id", "in"), ("ood", "out"))
+) + (
+    Column("wrong_share", "wrong weights %", "learned skinning weight that is on other bones than the body's own, %", "id",
+           ("weights", "wrong_share"), 100),
+    Column("right_bone", "right bone %", "vertices whose heaviest bone is the body's own, %", "id",
+           ("weights", "right_bone"), 100),
+)  # fmt: skip
+"""Columns of the second table; those that no run has are left out."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run: its numbers, or why there are none."""
+
+    job: Job
+    """The run."""
+    state: str
+    """done, failed, diverged, stopped or missing."""
+    reason: str = ""
+    """Why it is not done."""
+    values: dict[str, float] = field(default_factory=dict)
+    """Numbers by column, in the units of the columns."""
+    files: dict[str, Path] = field(default_factory=dict)
+    """Files that the numbers are from: train, id, ood."""
+
+    def unknown(self, column: Column) -> str | None:
+        """Return why there is no number: failed, diverged, missing, or `none` where the data has nothing to measure."""
+        if column.key in self.values:
+            return None
+        if self.state == "done" or column.stage in self.files:
+            return "none"
+        return "missing" if self.state in ("stopped", "running") else self.state
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number of a table, of one run or of several."""
+
+    mean: float | None
+    """Mean of the runs that have it: over the seeds of each subject, then over subjects."""
+    deviation: float | None
+    """Standard deviation over seeds of the mean over subjects; None with one seed, or where a run has no number."""
+    runs: int
+    """How many runs it should be of."""
+    count: int
+    """How many have it."""
+    unknown: dict[str, int]
+    """Why the others have not: how many failed, diverged or are missing."""
+
+    def text(self, digits: int) -> str:
+        """Return what the table says; never a plain mean of only some of the runs."""
+        others = ", ".join(f"{count} {why}" for why, count in sorted(self.unknown.items()) if why != "none")
+        if self.mean is None:
+            if not others:
+                return "–"
+            return next(iter(self.unknown)) if self.runs == 1 else others
+        number = f"{self.mean:.{digits}f}" + ("" if self.deviation is None else f" ± {self.deviation:.{digits}f}")
+        return f"{self.count} of {self.runs}: {number} ({others})" if others else number
+
+
+def collect(job: Job) -> Result:
+    """Read what a run measured.
+
+    A file counts only if it belongs to the settings of the job: the avatar was trained with them, and an evaluation is newer
+    than the avatar.
+    """
+    folder = Path(job.folder)
+    status = read_status(folder)
+    if status is None:
+        return Result(job, "missing", "not run yet")
+    if status.digest != job.digest:
+        return Result(job, "missing", f"{folder} holds a run with other settings")
+    values: dict[str, float] = {}
+    files: dict[str, Path] = {}
+    if status.trained and (folder / "avatar.pt").is_file() and (folder / "metrics.json").is_file():
+        files["train"] = folder / "metrics.json"
+    for evaluation in job.evaluations if "train" in files else ():
+        if is_evaluated(evaluation, folder / "avatar.pt"):
+            files[evaluation.split] = Path(evaluation.metrics)
+    contents = {stage: _read(path) for stage, path in files.items()}
+    for column in (*COLUMNS, *MORE_COLUMNS):
+        content = contents.get(column.stage)
+        value = None if content is None else _training_min(content) if not column.path else _look_up(content, column.path)
+        if value is not None:
+            values[column.key] = value * column.scale
+    return Result(job, *_state(status, job, files), values, files)
+
+
+def summarise(results: Sequence[Result], column: Column) -> Cell:
+    """Return the number of a table for some runs: a row's, or those of one row and subject."""
+    unknown: dict[str, int] = {}
+    by_subject: dict[str, list[float]] = {}
+    by_seed: dict[int, list[float]] = {}
+    for result in results:
+        why = result.unknown(column)
+        if why is not None:
+            unknown[why] = unknown.get(why, 0) + 1
+            continue
+        value = result.values[column.key]
+        by_subject.setdefault(result.job.subject, []).append(value)
+        by_seed.setdefault(result.job.seed, []).append(value)
+    count = sum(map(len, by_subject.values()))
+    if not count:
+        return Cell(None, None, len(results), 0, unknown)
+    mean = statistics.fmean(statistics.fmean(values) for values in by_subject.values())
+    whole = not unknown and len(by_seed) > 1
+    deviation = statistics.stdev(statistics.fmean(values) for values in by_seed.values()) if whole else None
+    return Cell(mean, deviation, len(results), count, unknown)
+
+
+def _state(status: Status, job: Job, files: dict[str, Path]) -> tuple[str, str]:
+    if status.state in ("failed", "diverged"):
+        return status.state, f"{status.stage}: {status.reason}"
+    if status.state == "done" and "train" not in files:
+        return "missing", f"{job.folder} has lost its avatar"
+    if status.state == "done":
+        return "done", ""
+    return "stopped", f"interrupted at {status.stage or 'the start'}"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = read_json(path, "metrics")
+    except UserError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _look_up(content: Any, path: Sequence[str]) -> float | None:
+    for name in path:
+        content = content.get(name) if isinstance(content, dict) else None
+    return content if isinstance(content, (int, float)) and math.isfinite(content) else None
+
+
+def _training_min(content: dict[str, Any]) -> float | None:
+    """Return the time of the whole training, also of one that was interrupted, whose file times its last part alone."""
+    step_s, steps = _look_up(content, ("timings", "seconds_per_step")), _look_up(content, ("steps",))
+    return None if step_s is None or steps is None else step_s * steps / 60

@@ -27,8 +27,8 @@ class ModelConfig:
     """Numbers to which the pose is reduced for each part; 0 for parts that do not deform."""
     part_weight: float = 0.5
     """Weight of the loss that gives each surface point to one part, by the true skinning weights."""
-    part_points: int = 512
-    """Surface points for that loss in each step."""
+    part_points: int = 128
+    """Surface points of each frame of a step for that loss."""
 
 
 @dataclass

@@ -202,7 +202,7 @@ def make_plan(experiment: Experiment, choice: Choice, resolve: Callable[[Sequenc
     resolved = {}
     for row in rows:
         try:
-            resolved[row.key] = resolve((*common, *row.overrides, *choice.extra))
+            resolved[row.key] = resolve((*common, *row.settings(training), *choice.extra))
         except UserError as error:
             raise UserError(f"row {row.key}: {error}") from None
     subjects = choice.subjects or experiment.subjects.get(data, ())
@@ -243,7 +243,7 @@ def _job(row: Row, data: str, subject: str, seed: int, training: str, choice: Ch
     machine = (f"device={choice.device}", *((f"threads={choice.threads}",) if choice.threads else ()))
     where = (_text("output_root", choice.output_root), f"run={name}")
     train = (
-        "train", f"subject={quote(subject)}", f"data={data}", f"training={training}", *row.overrides, *choice.extra,
+        "train", f"subject={quote(subject)}", f"data={data}", f"training={training}", *row.settings(training), *choice.extra,
         f"seed={seed}", _text("data_root", train_root), *where, *machine, "resume=true",
     )  # fmt: skip
     settings: dict[str, Any] = {"max_frames": choice.max_frames, "surface_frames": choice.surface_frames}

@@ -47,7 +47,7 @@ def test_a_key_stands_for_one_set_of_overrides():
     for experiment in EXPERIMENTS.values():
         for data in experiment.data:
             for row in experiment.rows:
-                what = (row.overrides, row.inside_test)
+                what = (row.settings("quick"), row.inside_test)
                 assert rows.setdefault((data, row.key), what) == what, row.key
         keys = [row.key for row in experiment.rows]
         assert len(set(keys)) == len(keys) and set(experiment.order) <= set(keys)

@@ -173,6 +173,10 @@ def _check(config: TrainConfig) -> None:
         check_number(f"shape.{name}", getattr(config.shape, name), 1)
     check_choice("model.name", config.model.name, SYSTEMS)
     check_skinning(config.skinning, config.search)
+    if config.model.name != "fast_snarf" and config.skinning.name in ("voxel", "preset"):
+        raise UserError(
+            f"skinning={config.skinning.name} is for model=fast_snarf; model {config.model.name} has weights of its own kind"
+        )
     check_search(config.search)
     check_number("seed", config.seed, 0)
 

@@ -75,8 +75,8 @@ _SNARF_LIGHT = (
 )  # fmt: skip
 _SNARF = Row("snarf", "SNARF", ("model=snarf", *_PAPERS), _SNARF_LIGHT, "snarf")
 _SNARF_NOTE = (
-    "With any preset but paper SNARF searches from nine bones and sees an eighth of the points in a step; the times of its rows "
-    "are for that."
+    "With any preset but paper SNARF searches from nine bones and sees an eighth of the points in a step; the times of its "
+    "rows are for that."
 )
 _FAST_SNARF = Row("fast_snarf-broyden", "Fast-SNARF", _BROYDEN, paper="fast_snarf")
 _GLOBAL = Row("ours-global", "ours, condition=global", (*_OURS, "condition=global"))

@@ -108,6 +108,13 @@ def test_systems_that_need_true_weights_refuse_samples_without(config_for, name,
     assert not Path(config.output_root).exists()
 
 
+def test_fields_of_the_grid_are_for_fast_snarf(config_for):
+    config = config_for("back_lbs")
+    with pytest.raises(UserError, match="skinning=voxel is for model=fast_snarf; model back_lbs has weights of its own"):
+        run(replace(config, skinning=replace(config.skinning, name="voxel")))
+    assert not Path(config.output_root).exists()
+
+
 @pytest.mark.parametrize("what", ["loss", "gradient"])
 def test_a_diverged_run_stops_keeps_its_checkpoint_and_says_so(config_for, monkeypatch, what):
     config = config_for("fast_snarf", steps=12)

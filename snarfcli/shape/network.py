@@ -91,6 +91,11 @@ class OccupancyNetwork(nn.Module):
                 else:
                     layer.weight.normal_(0, math.sqrt(2) / math.sqrt(layer.out_features))
                     layer.bias.zero_()
+                if index == 0 or index in self.config.skip_layers:
+                    # only the bare point has an influence at first, as waves would make it no sphere
+                    waves = 6 * len(self.config.frequencies)
+                    end = layer.in_features - joined
+                    layer.weight[:, end - waves : end] = 0
             elif last:
                 layer.weight.normal_(0, 1e-2)
                 layer.bias.zero_()

@@ -43,9 +43,10 @@ def test_condition_enters_like_a_joined_input():
     torch.testing.assert_close(network(x, condition, pose), network.layers[3](h)[:, 0], atol=1e-5, rtol=1e-5)
 
 
-def test_geometric_initialisation_is_about_a_sphere_of_one_metre():
+@pytest.mark.parametrize("frequencies", [[], [3.0, 30.0]])
+def test_geometric_initialisation_is_about_a_sphere_of_one_metre(frequencies):
     torch.manual_seed(0)
-    network = OccupancyNetwork(ShapeConfig(), 0, BONES)
+    network = OccupancyNetwork(ShapeConfig(frequencies=frequencies), 0, BONES)
     directions = torch.nn.functional.normalize(points(200), dim=1)
     index = torch.zeros(200, dtype=torch.long)
     no_pose = torch.zeros(1, 0)

@@ -19,17 +19,20 @@ from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import canonical_surface, field_surface
 from snarfcli.models.avatar import Avatar
 from snarfcli.progress import progress
-from snarfcli.reproduce.curves import line_chart
 from snarfcli.reproduce.experiments import Row
 from snarfcli.reproduce.plans import Plan
-from snarfcli.reproduce.results import Result
+from snarfcli.reproduce.results import COLUMNS, Result, summarise
 
-__all__ = ["draw_sequences", "draw_systems", "draw_weights"]
+__all__ = ["draw_sequences", "draw_stick_curves", "draw_stick_shapes", "draw_systems", "draw_weights"]
 
 log = logging.getLogger(__name__)
 
 _PANEL = 256
 _FRAMES = {"id": 2, "ood": 4}
+_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*", "h", "<", ">", "d")
+# The subjects of the 2D stick: what is extrapolated, and the step of the training angles, degrees.
+_STICKS = {"stick": "two bones", "stick_object": "two bones + object"}
+_STICK_STEPS = {"stick_step10": 10.0, "stick_step20": 20.0, "stick_step30": 30.0, "stick_step60": 60.0}
 _SEEN_FROM_RAD = 0.35  # a body in its canonical pose, nearly from the front
 
 
@@ -131,11 +134,66 @@ def draw_sequences(plan: Plan, results: Sequence[Result], folder: Path) -> tuple
         return None
     # from the easiest to the hardest, by the mean of all systems
     names.sort(key=lambda name: -np.mean([line[name] for line in lines.values() if name in line]))
-    series = {label: [line.get(name) for name in names] for label, line in lines.items()}
-    path = folder / "sequences.svg"
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+    axis = figure.subplots()
+    for number, (label, line) in enumerate(lines.items()):
+        values = [line.get(name, np.nan) for name in names]
+        axis.plot(names, values, label=label, linewidth=1.6, marker=_MARKS[number % len(_MARKS)], markersize=5)
+    axis.set_ylabel("surface IoU, %")
+    axis.tick_params(axis="x", rotation=25)
+    axis.grid(color="#DDDDDD", linewidth=0.8)
+    axis.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside right upper", frameon=False)
+    path = folder / "sequences.png"
     with atomic_path(path) as temporary:
-        temporary.write_text(line_chart(names, series, y_label="surface IoU, %"))
+        figure.savefig(temporary, dpi=130, facecolor="white")
     return path, "Surface IoU of each out-of-distribution sequence, mean over subjects and seeds"
+
+
+def draw_stick_shapes(plan: Plan, results: Sequence[Result], folder: Path) -> tuple[Path, str] | None:
+    """Draw the sticks out of distribution, the truth and each system (S Fig. 4). Arguments and result: as `draw_systems`."""
+    from snarfcli.reproduce.stick2d_figures import draw_shapes, extreme_poses
+
+    rows = []
+    for subject in (one for one in _STICKS if one in plan.subjects):
+        of_subject = [result for result in results if result.job.subject == subject and result.job.seed == plan.seeds[0]]
+        trained = {result.job.row: result for result in of_subject if "train" in result.files}
+        if trained:
+            avatars = {
+                row.label: Avatar.load(trained[row.key].job.folder) if row.key in trained else None
+                for row in plan.experiment.rows
+            }
+            rows += extreme_poses(_store(next(iter(trained.values())), "ood"), subject, avatars)
+    if not rows:
+        return None
+    draw_shapes(folder / "shapes.png", rows)
+    return folder / "shapes.png", f"Sticks out of distribution, seed {plan.seeds[0]} (as SNARF Fig. 4)"
+
+
+def draw_stick_curves(plan: Plan, results: Sequence[Result], folder: Path) -> tuple[Path, str] | None:
+    """Draw the IoU of the sticks out of distribution and by the step of training angles (S Fig. 5).
+
+    Arguments and result: as `draw_systems`. A number that lacks one of its runs is drawn as none.
+    """
+    from snarfcli.reproduce.stick2d_figures import draw_curves
+
+    columns = {column.key: column for column in COLUMNS}
+
+    def value(row: Row, subject: str, key: str) -> float | None:
+        some = [result for result in results if result.job.row == row.key and result.job.subject == subject]
+        cell = summarise(some, columns[key])
+        return None if cell.mean is None or cell.unknown else cell.mean / 100
+
+    extrapolation, interpolation = {}, {}
+    for row in plan.experiment.rows:
+        there = {subject: name for subject, name in _STICKS.items() if subject in plan.subjects}
+        extrapolation[row.label] = {name: value(row, subject, "bbox_ood") for subject, name in there.items()}
+        steps = {subject: step for subject, step in _STICK_STEPS.items() if subject in plan.subjects}
+        interpolation[row.label] = [(step, value(row, subject, "bbox_id")) for subject, step in steps.items()]
+    draw_curves(folder / "curves.png", extrapolation, interpolation)
+    return folder / "curves.png", "IoU of uniform points, mean over seeds (as SNARF Fig. 5)"
 
 
 def _trained(plan: Plan, results: Sequence[Result]) -> list[tuple[Row, Result]]:

@@ -129,7 +129,10 @@ def _figures(plan: Plan, results: Sequence[Result], folder: Path, resolution: in
     from snarfcli.reproduce import figures
 
     if plan.experiment.name == "stick2d":
-        wanted = figures.draw_stick2d(plan, results, folder)
+        wanted = [
+            ("shapes", partial(figures.draw_stick_shapes, plan, results, folder)),
+            ("curves", partial(figures.draw_stick_curves, plan, results, folder)),
+        ]
     else:
         draw = {"systems": figures.draw_systems, "weights": figures.draw_weights}
         wanted = [

@@ -1,0 +1,198 @@
+"""One run of a plan with commands that are played: what is done once, what is done again, and what is written about it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from made_up_runs import fake_metrics, fake_plan, fake_samples
+
+from snarfcli.files import write_json
+from snarfcli.reproduce.jobs import LOG, STATUS, JobStopped, read_status, run_command, run_job
+from snarfcli.reproduce.locks import locked, one_of
+from snarfcli.reproduce.results import collect
+
+
+class Player:
+    """Plays `snarf`: writes the files that its commands write, and fails or stops where it is told to."""
+
+    def __init__(self, job, **codes: int) -> None:
+        self.job, self.codes, self.calls = job, codes, []
+
+    def __call__(self, arguments, log, stopped):
+        command = next((a.split("=")[1] for a in arguments if a.startswith("split=")), arguments[0])
+        self.calls.append(command)
+        with Path(log).open("a") as file:
+            file.write(f"$ snarf {command}\nbusy\n")
+            code = self.codes.get(command, 0)
+            if code == 130:
+                raise JobStopped
+            if code:
+                file.write(f"snarf {command}: the reason: what to do\n")
+                return code
+        self.play(command)
+        return 0
+
+    def play(self, command):
+        folder = Path(self.job.folder)
+        if command == "preprocess":
+            fake_samples(folder.parents[3] / "data", self.job.subject)
+        elif command == "train":
+            write_json(folder / "metrics.json", {"status": "trained", "steps": 10, "timings": {"seconds_per_step": 1.0}})
+            (folder / "avatar.pt").write_bytes(b"avatar")
+        else:
+            evaluation = next(one for one in self.job.evaluations if one.split == command)
+            write_json(evaluation.metrics, fake_metrics(0.8, evaluation.settings))
+
+
+@pytest.fixture
+def job(tmp_path):
+    return fake_plan(tmp_path, systems=("snarf",)).jobs[0]
+
+
+def test_everything_is_done_once(job):
+    player = Player(job)
+    status = run_job(job, runner=player)
+    assert player.calls == ["train", "id", "ood"] and status.state == "done" and status.trained
+    assert set(status.seconds) == {"train", "id", "ood"} and read_status(Path(job.folder)) == status
+    assert collect(job).values["surface_ood"] == 80.0
+    again = Player(job)
+    assert run_job(job, runner=again).state == "done" and again.calls == []
+
+
+def test_missing_samples_are_made_first(job, tmp_path):
+    (tmp_path / "data/processed/builtin/50002/manifest.json").unlink()
+    player = Player(job)
+    assert run_job(job, runner=player).state == "done"
+    assert player.calls == ["preprocess", "train", "id", "ood"]
+
+
+def test_an_interrupted_run_goes_on_at_the_stage_where_it_stopped(job):
+    for stage, left in (("train", ["train", "id", "ood"]), ("ood", ["ood"])):
+        status = run_job(job, runner=Player(job, **{stage: 130}))
+        assert status.state == "stopped" and status.stage == stage
+        assert collect(job).state == "stopped" and f"interrupted at {stage}" in collect(job).reason
+        player = Player(job, ood=130 if stage == "train" else 0)
+        run_job(job, runner=player)
+        assert player.calls == left
+    assert collect(job).state == "done"
+
+
+def test_a_stopped_plan_begins_nothing(job):
+    player = Player(job)
+    assert run_job(job, runner=player, stopped=lambda: True).state == "stopped"
+    assert player.calls == [] and not (Path(job.folder) / STATUS).exists()
+
+
+def test_a_failure_is_kept_with_its_reason_and_tried_again(job):
+    status = run_job(job, runner=Player(job, train=2))
+    assert (status.state, status.stage, status.reason, status.trained) == ("failed", "train", "the reason: what to do", False)
+    result = collect(job)
+    assert result.state == "failed" and result.values == {} and "the reason" in result.reason
+    player = Player(job)
+    assert run_job(job, runner=player).state == "done" and player.calls == ["train", "id", "ood"]
+
+
+def test_a_failed_evaluation_leaves_the_numbers_of_the_other(job):
+    assert run_job(job, runner=Player(job, ood=1)).state == "failed"
+    result = collect(job)
+    assert result.values["surface_id"] == 80.0 and "surface_ood" not in result.values
+    player = Player(job)
+    assert run_job(job, runner=player).state == "done" and player.calls == ["ood"]
+
+
+def test_a_diverged_run_stays_so(job):
+    class Diverging(Player):
+        def __call__(self, arguments, log, stopped):
+            code = super().__call__(arguments, log, stopped)
+            write_json(Path(self.job.folder) / "metrics.json", {"status": "diverged", "steps": 5})
+            return code
+
+    assert run_job(job, runner=Diverging(job, train=2)).state == "diverged"
+    assert collect(job).state == "diverged"
+    again = Player(job)
+    assert run_job(job, runner=again).state == "diverged" and again.calls == [], "the same seed would lead there again"
+
+
+def test_a_new_avatar_is_evaluated_anew(job):
+    run_job(job, runner=Player(job))
+    later = time.time() + 5
+    os.utime(Path(job.folder) / "avatar.pt", (later, later))
+    assert "surface_id" not in collect(job).values, "numbers of an older avatar"
+    player = Player(job, id=2)
+    run_job(job, runner=player)
+    assert player.calls == ["id"] and not Path(job.evaluations[0].metrics).exists()
+
+
+def test_other_settings_are_left_to_train_to_judge(job, tmp_path):
+    run_job(job, runner=Player(job))
+    other = fake_plan(tmp_path, systems=("snarf",)).jobs[0]
+    other = type(other)(**{**vars(other), "digest": "another"})
+    assert collect(other).state == "missing" and "other settings" in collect(other).reason
+    player = Player(other, train=2)
+    assert run_job(other, runner=player).state == "failed" and player.calls == ["train"]
+
+
+def test_data_without_the_split_is_no_failure(job, tmp_path):
+    fake_samples(tmp_path / "data", "50002", ood=0)
+    player = Player(job)
+    assert run_job(job, runner=player).state == "done" and player.calls == ["train", "id"]
+
+
+def test_a_command_says_what_it_said_and_why_it_failed(job, tmp_path):
+    log = tmp_path / LOG
+    assert run_command(["train", "training=quik"], log, lambda: False) == 2
+    assert log.read_text().startswith("$ snarf train training=quik\n") and "did you mean 'quick'" in log.read_text()
+    wrong = type(job)(**{**vars(job), "train": ("train", "training=quik")})
+    assert "there is no training=quik" in run_job(wrong).reason
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
+def test_a_command_that_is_stopped_gets_one_ctrl_c(tmp_path, monkeypatch):
+    script = tmp_path / "program.py"
+    script.write_text(
+        "import signal, sys, time\n"
+        "def handle(*_): print('checkpoint written', flush=True); sys.exit(130)\n"
+        "signal.signal(signal.SIGINT, handle)\nprint('ready', flush=True)\ntime.sleep(60)\n"
+    )
+    original = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda command, **more: original([sys.executable, str(script)], **more))
+    log = tmp_path / LOG
+    with pytest.raises(JobStopped):
+        run_command(["train"], log, lambda: log.exists() and "ready" in log.read_text())
+    assert log.read_text().count("checkpoint written") == 1
+
+
+def test_a_command_that_is_killed_is_named(job):
+    def killed(arguments, log, stopped):
+        Path(log).write_text("busy\n")
+        return -signal.SIGKILL
+
+    assert run_job(job, runner=killed).reason == "ended by SIGKILL (out of memory?)"
+
+
+def test_a_lock_keeps_the_second_out_until_the_first_is_done(tmp_path):
+    pytest.importorskip("fcntl")
+    events = []
+
+    def second():
+        with locked(tmp_path / "lock"):
+            events.append("second")
+
+    with locked(tmp_path / "lock"):
+        thread = threading.Thread(target=second)
+        thread.start()
+        with pytest.raises(JobStopped), locked(tmp_path / "lock", check=lambda: (_ for _ in ()).throw(JobStopped())):
+            pass
+        events.append("first")
+    thread.join()
+    assert events == ["first", "second"]
+    with one_of([tmp_path / "a", tmp_path / "b"]), one_of([tmp_path / "a", tmp_path / "b"]):
+        events.append("two slots")
+    assert events[-1] == "two slots"

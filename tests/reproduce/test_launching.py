@@ -1,0 +1,98 @@
+"""Hydra's launchers: the jobs of a plan run through them, each on its own, and what becomes of them comes back."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from made_up_runs import fake_plan, fake_run
+
+from snarfcli.errors import UserError
+from snarfcli.reproduce import launching
+from snarfcli.reproduce.launching import Launcher, check_launcher, launch, run_planned_job
+
+
+@pytest.mark.parametrize("name", ["basic", "joblib"])
+def test_a_launcher_brings_every_job_to_its_end(name, tmp_path, monkeypatch):
+    if name != "basic" and importlib.util.find_spec(f"hydra_plugins.hydra_{name}_launcher") is None:
+        pytest.skip(f"hydra-{name}-launcher is not installed")
+    monkeypatch.chdir(tmp_path)
+    jobs = fake_plan(tmp_path, systems=("snarf", "nasa")).jobs
+    for job in jobs:  # all is there already, so that only the way through the launcher is tested
+        fake_run(job, {"id": 0.9, "ood": 0.8})
+    seen = []
+    processes = 2 if name == "joblib" else 1
+    statuses = launch(jobs, tmp_path / "work", Launcher(name, processes), lambda *change: seen.append(change))
+    assert [status.state for status in statuses] == ["done", "done"]
+    assert {number for number, status in seen if status.state == "done"} == {0, 1} and len(seen) <= 4
+    assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs", "work"}, "nothing is left behind elsewhere"
+
+
+def test_a_launcher_that_does_not_start_is_an_error(tmp_path, monkeypatch):
+    jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
+    monkeypatch.setattr(launching, "_arguments", lambda *_: ["reproduce_job", "plan=none.json", "job=0"])
+    with pytest.raises(UserError, match="launcher=basic started no job: .*no plan at .*none.json; see"):
+        launch(jobs, tmp_path / "work", Launcher(), lambda *_: None)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
+def test_ctrl_c_stops_jobs_and_waits_for_them(tmp_path, monkeypatch):
+    jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
+    # a launcher that waits for the sign to stop, as a job does
+    code = "import pathlib, sys, time\nwork = pathlib.Path(sys.argv[1])\n"
+    code += "(work / 'begun').touch()\nwhile not (work / 'stop').exists(): time.sleep(0.05)\n(work / 'ended').touch()\n"
+    original, begun = subprocess.Popen, time.monotonic()
+
+    def popen(command, **more):
+        (work,) = (tmp_path / "work").iterdir()
+        return original([sys.executable, "-c", code, str(work)], **more)
+
+    monkeypatch.setattr(subprocess, "Popen", popen)
+
+    def press():
+        while not list(tmp_path.glob("work/*/begun")) and time.monotonic() - begun < 20:
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGTERM)  # taken for Ctrl-C
+
+    thread = threading.Thread(target=press)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        launch(jobs, tmp_path / "work", Launcher(), lambda *_: None)
+    thread.join()
+    assert list(tmp_path.glob("work/*/ended")), "it was waited for"
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_launchers_that_are_not_installed_name_what_to_install(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    check_launcher(Launcher())
+    with pytest.raises(UserError, match=r"needs hydra-joblib-launcher; install it with: pip install 'snarf\[joblib\]'"):
+        check_launcher(Launcher("joblib", 2))
+    with pytest.raises(UserError, match=r"pip install 'snarf\[submitit\]'"):
+        check_launcher(Launcher("submitit_slurm"))
+    with pytest.raises(UserError, match="one job at a time, got processes=2; give launcher=joblib"):
+        check_launcher(Launcher("basic", 2))
+
+
+def test_settings_reach_hydra(tmp_path):
+    arguments = launching._arguments(tmp_path, 3, Launcher("submitit_slurm", 8, 4, ("partition=gpu", "timeout_min=60")))
+    assert {"job=0,1,2", "-m", "hydra/launcher=submitit_slurm", "hydra.launcher.partition=gpu"} <= set(arguments)
+    assert {"hydra.launcher.array_parallelism=8", "hydra.launcher.cpus_per_task=4"} <= set(arguments)
+    assert "hydra.launcher.timeout_min=60" in arguments and len([a for a in arguments if "timeout_min" in a]) == 1
+    assert "hydra.launcher.n_jobs=2" in launching._arguments(tmp_path, 3, Launcher("joblib", 2))
+    assert launching._slots(Launcher("submitit_local", 3)) == 3 and launching._slots(Launcher("joblib", 3)) is None
+
+
+def test_a_job_that_is_not_in_the_plan_is_refused(tmp_path):
+    with pytest.raises(UserError, match="no plan at"):
+        run_planned_job(tmp_path / "plan.json", 0)
+    (tmp_path / "plan.json").write_text('{"jobs": [], "slots": null}')
+    with pytest.raises(UserError, match="has no job 3"):
+        run_planned_job(Path(tmp_path / "plan.json"), 3)

@@ -1,0 +1,146 @@
+"""`snarf reproduce`: how it is called, and a whole table of a subject that is a bending capsule."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+from toy_training import toy_store
+
+from snarfcli import cli
+from snarfcli.commands import reproduce
+from snarfcli.commands.reproduce import ReproduceConfig, run
+from snarfcli.reproduce.jobs import JobStopped, run_job
+from snarfcli.settings import config_folder, quote_items
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(capsys, *arguments):
+    code = cli.main(["reproduce", *arguments])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+WRONG = {
+    ("tabel1",): "one of table1, table2, ablations, stick2d, clothed, all, got 'tabel1'; did you mean 'table1'?",
+    (): "wanted what to reproduce",
+    ("table1", "systems=[nsa]"): "there is no row 'nsa'; did you mean 'nasa'?",
+    ("table1", "training=quik"): "there is no training=quik; did you mean 'quick'?",
+    ("table1", "data=cap"): "table1 is made on data=builtin or dfaust, got 'cap'",
+    ("table1", "subjects=[50003]"): "no subject '50003'; did you mean '500",
+    ("table1", "extra=[training.stps=1]"): "row pose_onet: unknown setting 'training.stps'; did you mean 'training.steps'?",
+    ("table1", "launcher=slurm"): "launcher must be basic or joblib",
+    ("table1", "processes=2"): "launcher=basic runs one job at a time, got processes=2",
+    ("table1", "launcher_settings=[gpu]"): "launcher_settings: wanted settings such as [partition=gpu], got 'gpu'",
+    ("table1", "table2"): "'table2' is no setting",
+    ("table1", "sistems=[nasa]"): "unknown setting 'sistems'; did you mean 'systems'?",
+}
+
+
+@pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
+def test_a_user_error_is_one_line_with_code_2(capsys, elsewhere, arguments):
+    code, out, err = call(capsys, *arguments)
+    assert code == 2 and WRONG[arguments] in err
+    assert len(err.strip().splitlines()) == 1 and "Traceback" not in out + err
+    assert not list(elsewhere.iterdir()), "something was left behind"
+
+
+def test_a_dry_run_prints_commands_and_does_nothing(capsys, caplog, elsewhere):
+    caplog.set_level(logging.INFO, "snarfcli")
+    extra = "extra=[training.steps=9,skinning.resolution=[8,8,4]]"
+    code, _, err = call(capsys, "table1", "--dry-run", "subjects=[50002]", "systems=[nasa]", extra)
+    assert code == 0, err
+    assert "run 1 of 1: NASA, subject 50002, seed 0, outputs/builtin/50002/nasa-quick-s0-" in caplog.text
+    assert "snarf preprocess subject='50002' data=builtin" in caplog.text
+    assert "model=nasa condition=global training.steps=9 skinning.resolution=[8,8,4] seed=0" in caplog.text
+    assert not list(elsewhere.iterdir())
+
+
+def test_lists_of_settings_may_be_written_plainly():
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    for text, wanted in {
+        "[a=1]": ["a=1"],
+        "[a=1,b.c=[1,2],d={x:1,y:2}]": ["a=1", "b.c=[1,2]", "d={x:1,y:2}"],
+        "[]": [],
+        "['a=1', \"b=it's\"]": ["a=1", "b=it's"],
+        "[a=x'y,z']": ["a=x'y,z'"],
+    }.items():
+        assert OverridesParser.create().parse_override(f"extra={quote_items(text)}").value() == wanted, text
+    assert quote_items("null") == "null"
+
+
+def test_the_command_is_written_as_it_can_be_typed():
+    defaults = OmegaConf.to_container(OmegaConf.load(config_folder() / "reproduce" / "reproduce.yaml"))
+    defaults.pop("defaults")
+    config = ReproduceConfig(**{**defaults, "what": "table1", "subjects": ["50002"], "extra": ["a.b=1"], "figures": False})
+    assert reproduce._command(config) == "snarf reproduce table1 subjects=[50002] extra=[a.b=1] figures=false"
+
+
+def in_this_process(arguments, log, stopped):
+    """Run a command of a job without a process of its own, which would take seconds to start."""
+    if stopped():
+        raise JobStopped
+    Path(log).parent.mkdir(parents=True, exist_ok=True)
+    Path(log).touch()
+    return cli.main(arguments)
+
+
+def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
+    """Systems that train, one that fails, and the same command again."""
+    toy_store(tmp_path / "data", points=400, frames=8)
+    caplog.set_level(logging.INFO, "snarfcli")
+    defaults = OmegaConf.to_container(OmegaConf.load(config_folder() / "reproduce" / "reproduce.yaml"))
+    defaults.pop("defaults")
+    config = ReproduceConfig(**defaults | dict(
+        what="table1", subjects=["toy"], training="smoke", systems=["back_d", "fast_snarf-broyden", "ours-local"],
+        data_root=str(tmp_path / "data"), output_root=str(tmp_path / "outputs"), figure_resolution=16, threads=1,
+        extra=["training.steps=3", "training.validate_every=3", "skinning.resolution=[8,8,8]", "shape.width=16",
+               "skinning.bone_radius_m=0.3"],
+    ))  # fmt: skip
+    calls = []
+
+    def launch(jobs, folder, launcher, on_change):
+        for number, job in enumerate(jobs):
+            def runner(arguments, log, stopped, job=job):
+                calls.append((job.row, arguments[0]))
+                if job.row == "back_d":
+                    Path(log).write_text("busy\nsnarf train: no such luck\n")
+                    return 2
+                return in_this_process(arguments, log, stopped)
+
+            on_change(number, run_job(job, runner=runner))
+
+    monkeypatch.setattr(reproduce, "launch", launch)
+    assert run(config) == 1, "one failed"
+    assert [call for call in calls if call[0] == "ours-local"] == [("ours-local", name) for name in ("train", "eval", "eval")]
+    folder = tmp_path / "outputs/reproduce/table1"
+    text = (folder / "table1.md").read_text()
+    assert "| Back-D | failed | failed |" in text and "- Back-D, subject toy, seed 0: failed: train: no such luck" in text
+    rows = list(csv.DictReader(io.StringIO((folder / "table1.csv").read_text())))
+    of_runs = {row["row"]: row for row in rows if row["level"] == "run"}
+    assert {row: of_runs[row]["state"] for row in of_runs} == {
+        "back_d": "failed", "fast_snarf-broyden": "done", "ours-local": "done",
+    }  # fmt: skip
+    assert all(0 <= float(of_runs["ours-local"][name]) <= 100 for name in ("bbox_id", "surface_id", "bbox_ood", "surface_ood"))
+    assert (folder / of_runs["ours-local"]["ood_file"]).is_file() and (folder / "figures/systems.png").is_file()
+    assert "1 of 3: Back-D, subject toy, seed 0: failed (train: no such luck)" in caplog.text
+    assert "IoU in/out of distribution" in caplog.text
+
+    calls.clear()
+    assert run(config) == 1
+    assert set(calls) == {("back_d", "train")}, "what is done is not done again"
+    again = ReproduceConfig(**asdict(config) | {"only_report": True, "systems": ["ours-local", "nasa"], "figures": False})
+    calls.clear()
+    assert run(again) == 1 and calls == []
+    assert "| NASA | missing | missing |" in (folder / "table1.md").read_text()

@@ -36,17 +36,17 @@ def test_cape_changes_what_the_preset_of_training_says_whatever_comes_first(caps
     config = composed(capsys, "train", *(choices if is_first else choices[::-1]))
     without = composed(capsys, "train", f"training={training}")
     assert config.pop("experiment") == "cape" and without.pop("experiment") is None
-    changed = {key: (config["shape"].pop(key), without["shape"].pop(key)) for key in ("frequencies", "condition_layer")}
+    frequencies, others = config["shape"].pop("frequencies"), without["shape"].pop("frequencies")
+    assert frequencies != others
+    assert (config["condition"].pop("layer"), without["condition"].pop("layer")) == (0, None if training == "paper" else 2)
     assert config == without  # width, depth, losses and steps are the preset's, the data the user's
-    frequencies, layer = changed["frequencies"][0], changed["condition_layer"][0]
-    assert layer == 0 and changed["condition_layer"][1] > 0
     ratios = [b / a for a, b in zip(frequencies[:-1], frequencies[1:], strict=True)]
     assert len(ratios) > 2 and ratios == pytest.approx([2.0] * len(ratios), rel=1e-3)
 
 
 def test_single_settings_and_other_choices_win(capsys):
-    config = composed(capsys, "train", "experiment=cape", "shape.condition_layer=2", "data=clothed", "condition=local")
-    assert (config["shape"]["condition_layer"], config["data"]["name"], config["condition"]["name"]) == (2, "clothed", "local")
+    config = composed(capsys, "train", "experiment=cape", "condition.layer=3", "data=clothed", "condition=local")
+    assert (config["condition"]["layer"], config["data"]["name"], config["condition"]["name"]) == (3, "clothed", "local")
     config = composed(capsys, "train", "experiment=smoke", "training=standard", "data_root=mine")
     assert config["training"]["name"] == "standard" and config["data_root"] == "mine"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -97,8 +97,13 @@ class System(nn.Module):
 
     def _make_shape(self, bones: Tensor) -> nn.Module:
         """Return the network that says what is occupied; `bones` [S, 2, 3] are the canonical ends of the bones, metres."""
-        pose_size = 0 if self.config.condition.name == "none" else 3 * (self.num_bones - 1)
-        return OccupancyNetwork(self.config.shape, pose_size, bones)
+        shape, condition = self.config.shape, self.config.condition
+        if condition.layer is not None:
+            shape = replace(shape, condition_layer=condition.layer)
+        if condition.size is not None:
+            shape = replace(shape, condition_size=condition.size)
+        pose_size = 0 if condition.name == "none" else 3 * (self.num_bones - 1)
+        return OccupancyNetwork(shape, pose_size, bones)
 
     # ---------------------------------------------------------------- the field
     def forward(

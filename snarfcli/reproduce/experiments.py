@@ -148,6 +148,7 @@ _ABLATIONS = Experiment(
         _changed("all_cells", "every cell active", "skinning.bone_radius_m=null", "training.refresh_cells_every=0"),
         _changed("parity", "labels by ray parity", inside_test="parity"),
         _LOCAL,
+        _changed("global_early", "condition=global, entering where local's does", "condition.layer=2", "condition.size=16"),
         _NONE,
         _changed("target_parent", "joint target: parent (F)", "training.joint_target=parent"),
         _changed("target_own", "joint target: own (released code)", "training.joint_target=own"),

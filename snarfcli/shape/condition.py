@@ -17,6 +17,10 @@ CONDITIONS = ("global", "local", "none")
 class ConditionConfig:
     name: str = "global"
     """global (every joint's angles at every point, as in the papers), local (those of the joints that move it) or none."""
+    layer: int | None = None
+    """Layer of the canonical shape that the condition enters; null: shape.condition_layer."""
+    size: int | None = None
+    """Size of the code that it is reduced to before; null: shape.condition_size."""
 
 
 def joints_of_bones(parents: Sequence[int]) -> Tensor:

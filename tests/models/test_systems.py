@@ -18,6 +18,7 @@ from snarfcli.models.pointwise import invert_blended
 from snarfcli.models.settings import ModelConfig
 from snarfcli.models.smpl_nn import nearest_vertex
 from snarfcli.models.system import MeshTemplate
+from snarfcli.shape import ConditionConfig
 from snarfcli.training.extent import rough_canonical_points
 from snarfcli.training.trainer import Trainer
 
@@ -201,6 +202,17 @@ def test_surface_points_belong_to_one_part(store):
 def test_local_condition_needs_skinning_weights(store, name):
     with pytest.raises(ValueError, match=f"model {name} has no skinning weights for condition=local"):
         new_system(store, name, condition="local")
+
+
+def test_the_condition_may_say_where_it_enters(store):
+    """Whatever the shape says of it, which stays the default."""
+    config = avatar_config()
+    grid = CanonicalGrid(torch.full((3,), -1.0), torch.full((3,), 1.0))
+    for condition, layer, size in ((ConditionConfig("local"), 2, 4), (ConditionConfig("local", 1, 7), 1, 7)):
+        shape = Avatar(replace(config, condition=condition), store.skeleton, grid).model.shape
+        assert shape.config.condition_layer == layer
+        assert shape.pose_code.out_features == size
+        assert shape.layers[layer].in_features == 32 + size
 
 
 @pytest.mark.parametrize("name", ["back_lbs", "smpl_nn", "snarf"])

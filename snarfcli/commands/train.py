@@ -43,6 +43,7 @@ _NOT_NEGATIVE = (
     "uniform_points", "surface_points", "far_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight",
     "joint_weight", "validation_frames", "refresh_cells_every", "workers",
 )  # fmt: skip
+_LEAST_OF_PARTS = {"part_width": 1, "part_depth": 1, "part_code": 0, "part_weight": 0, "part_points": 1}
 
 
 @dataclass
@@ -172,6 +173,10 @@ def _check(config: TrainConfig) -> None:
     for name in ("width", "depth"):
         check_number(f"shape.{name}", getattr(config.shape, name), 1)
     check_choice("model.name", config.model.name, SYSTEMS)
+    for name, least in _LEAST_OF_PARTS.items():
+        check_number(f"model.{name}", getattr(config.model, name), least)
+    if config.model.name == "snarf" and config.search.name != "broyden":
+        raise UserError("model=snarf has no cells to search; leave search out, or give search=snarf or search=broyden")
     check_skinning(config.skinning, config.search)
     if config.model.name != "fast_snarf" and config.skinning.name in ("voxel", "preset"):
         raise UserError(

@@ -116,14 +116,16 @@ class Avatar:
             config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"]))
             grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
             skeleton = Skeleton.from_dict(content["skeleton"])
-            template = content.get("template")
-            template = None if template is None else MeshTemplate(template["vertices"], template["weights"])
+            template = _read_template(content.get("template"), config.model.name, skeleton.num_joints)
             field = None
             if config.skinning.name == "preset" and config.model.name == "fast_snarf":
                 field = PresetWeights.placeholder(grid, tuple(config.skinning.resolution[::-1]), skeleton.num_joints)
             avatar = cls(config, skeleton, grid, facts=content["facts"], field=field, template=template)
             avatar.model.load_state_dict(content["state"])
-        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError, OmegaConfBaseException) as error:
+        except (
+            LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError, MemoryError,
+            OmegaConfBaseException,
+        ) as error:  # fmt: skip
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise UserError(f"{path} does not describe an avatar of this version ({reason}); train it again") from None
         avatar.model.eval()
@@ -224,6 +226,29 @@ class Avatar:
         pose = torch.as_tensor(pose).reshape(-1, 3)
         translation = None if translation is None else torch.as_tensor(translation).reshape(3)
         return surfaces[surface](self, pose, translation, resolution=resolution)
+
+
+def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | None:
+    """Return the mesh that a file holds for a system, None where the system keeps none.
+
+    Raises:
+        ValueError: the system needs one, and the file holds none that can be used.
+    """
+    if model not in SYSTEMS or not SYSTEMS[model].keeps_template:
+        return None
+    if not isinstance(content, dict):
+        raise ValueError(f"model {model} needs a template, got {type(content).__name__}")
+    for name, columns in (("vertices", 3), ("weights", num_joints)):
+        part = content[name]
+        if not isinstance(part, Tensor) or part.ndim != 2 or part.shape[1] != columns or not len(part):
+            came = list(part.shape) if isinstance(part, Tensor) else type(part).__name__
+            raise ValueError(f"template.{name}: wanted shape [V, {columns}], got {came}")
+        if part.dtype != torch.float32 or not bool(part.isfinite().all()):
+            raise ValueError(f"template.{name}: wanted finite numbers of dtype torch.float32")
+    template = MeshTemplate(content["vertices"], content["weights"])
+    if len(template.vertices) != len(template.weights):
+        raise ValueError(f"template: {len(template.vertices)} vertices, but weights for {len(template.weights)}")
+    return template
 
 
 def load_checkpoint(path: str | Path, file_format: str, version: int, what: str) -> dict[str, Any]:

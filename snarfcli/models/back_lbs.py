@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import BonePrior, CanonicalGrid
@@ -63,6 +64,14 @@ class BackLBS(PointwiseSystem):
     def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         weights = self.posed_weights(points, bone_transforms, pose)
         return invert_blended(points, weights, bone_transforms), weights
+
+    def bone_logits(
+        self, points: Tensor, owner: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+    ) -> Tensor:
+        # Canonical points have no weights here, but those of a bone move with it: that says which joints they see.
+        index = torch.arange(len(points), device=points.device) % len(pose)
+        weights = F.one_hot(owner, self.num_bones).to(points)
+        return self.canonical_logits(points, self.condition(pose), index, precision, weights)
 
     def joint_weights(self, joints: Tensor, bone_transforms: Tensor, pose: Tensor) -> Tensor:
         """Return the weights at the posed joints, [B, J, J]."""

@@ -32,8 +32,8 @@ class Nasa(PointwiseSystem):
 
     Each part sees a point in the frame of its bone, and a few numbers to which the pose, written as the place of the root joint
     in the frames of all bones, is reduced for it alone. The union of the parts is the maximum over them. A loss gives each
-    surface point to the part with the largest true skinning weight; the losses of the canonical frame do not apply. With
-    `model.part_code=0` parts are rigid, which Deng et al. call NASA (R); otherwise they deform, NASA (D).
+    surface point to the part with the largest true skinning weight. The loss that fills the bones applies where the pose moves
+    them. With `model.part_code=0` parts are rigid, which Deng et al. call NASA (R); otherwise they deform, NASA (D).
 
     Occupancies are learned by cross-entropy, as in all systems here; the paper has squared errors.
 
@@ -63,7 +63,7 @@ class Nasa(PointwiseSystem):
     ) -> FieldSamples:
         start = time.perf_counter()
         inverse, code = self._bone_frames(bone_transforms)
-        after = time.perf_counter()
+        after = self.time_s()
         logits = self._part_logits(points, inverse, code, precision).amax(1)
         return every_point(logits, after - start, time.perf_counter() - after)
 
@@ -72,7 +72,7 @@ class Nasa(PointwiseSystem):
         return self._part_logits(points, *self._bone_frames(bone_transforms), precision)
 
     def _bone_frames(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what takes posed points into the frame of each bone [B, J, 4, 4], and the root joint there [B, J, 3]."""
+        """Return what takes posed points into the frame of each bone [B, J, 3, 4], and the root joint there [B, J, 3]."""
         inverse = invert_rigid(bone_transforms)
         inverse = torch.cat([inverse[..., :3, :3], inverse[..., :3, 3:] - self._joints[:, :, None]], -1)
         root = bone_transforms[:, 0, :3, :3] @ self._joints[0] + bone_transforms[:, 0, :3, 3]

@@ -63,6 +63,8 @@ def nearest_vertex(points: Tensor, vertices: Tensor) -> Tensor:
         from scipy.spatial import cKDTree
 
         finite = np.nan_to_num(points.detach().numpy(), posinf=1e6, neginf=-1e6)
-        return torch.from_numpy(cKDTree(vertices.numpy()).query(finite)[1]).long()
+        return torch.from_numpy(cKDTree(vertices.detach().numpy()).query(finite)[1]).long()
     parts = points.split(max(1, _PAIRS_AT_ONCE // len(vertices)))
-    return torch.cat([torch.cdist(part, vertices).argmin(1) for part in parts])
+    # By differences: as a matrix product, distances of a centimetre are wrong by millimetres some metres from the origin.
+    exact = "donot_use_mm_for_euclid_dist"
+    return torch.cat([torch.cdist(part, vertices, compute_mode=exact).argmin(1) for part in parts])

@@ -12,6 +12,7 @@ from toy_training import avatar_config, toy_store, training_config
 
 from snarfcli.deformer import CanonicalGrid, SearchConfig
 from snarfcli.deformer.skinning import skin
+from snarfcli.errors import UserError
 from snarfcli.models.avatar import SYSTEMS, Avatar
 from snarfcli.models.nasa import PartNetworks
 from snarfcli.models.pointwise import invert_blended
@@ -218,9 +219,62 @@ def test_the_condition_may_say_where_it_enters(store):
 @pytest.mark.parametrize("name", ["back_lbs", "smpl_nn", "snarf"])
 def test_local_condition_shows_each_point_the_joints_that_move_it(store, name):
     avatar = new_system(store, name, condition="local")
-    transforms = avatar.bone_transforms(POSES)
-    samples = avatar.query(points_near(avatar, transforms), transforms, POSES)
-    assert bool(samples.logits.isfinite().all())
+    model, transforms = avatar.model, avatar.bone_transforms(POSES)
+    model._joints_of_bones = torch.tensor([[0.0], [1.0]])  # of the two bones alone, each sees the joint between them
+    with torch.no_grad():
+        model.shape.pose_code.weight.mul_(30)  # so that it matters what a point sees
+    if name == "snarf":
+        found = model.deformer(points_near(avatar, transforms), transforms)
+        canonical, pose, weights = found.canonical, found.pose, model.skinning_weights(found.canonical)
+        logits = model.canonical_logits(canonical, model.condition(POSES), pose)
+    else:
+        points = points_near(avatar, transforms)
+        canonical, weights = (part.flatten(0, 1) for part in model.canonical_points(points, transforms, POSES))
+        pose = torch.arange(2).repeat_interleave(points.shape[1])
+        logits = avatar.query(points, transforms, POSES).logits.flatten()
+    wanted = model.shape(canonical, model.condition(POSES), pose, weights[:, 1:])
+    torch.testing.assert_close(logits.detach(), wanted.detach(), atol=1e-4, rtol=1e-4)
+    assert not torch.allclose(wanted, model.shape(canonical, model.condition(POSES), pose), atol=1e-2)
+
+
+def test_points_of_bones_see_the_joints_of_their_bone(store):
+    model = new_system(store, "back_lbs", condition="local").model
+    model._joints_of_bones = torch.tensor([[0.0], [1.0]])
+    points = torch.rand(1, 3, generator=torch.Generator().manual_seed(0)).expand(2, 3)  # one for each pose
+    transforms = torch.eye(4).expand(2, 2, 4, 4)
+    for owner, sees in ((0, False), (1, True)):
+        first, second = model.bone_logits(points, torch.tensor([owner, owner]), transforms, POSES).tolist()
+        assert (first != pytest.approx(second, abs=1e-5)) == sees
+
+
+SPOILT_TEMPLATES = {
+    "template.vertices: wanted shape .V, 3., got .3.": {"vertices": torch.zeros(3)},
+    "template.vertices: wanted finite numbers": {"vertices": torch.full((4, 3), torch.nan)},
+    "template.vertices: wanted finite numbers of dtype torch.float32": {"vertices": torch.zeros(4, 3, dtype=torch.int32)},
+    "template.weights: wanted shape .V, 2., got .4, 7.": {"weights": torch.zeros(4, 7)},
+    "template.weights: wanted shape .V, 2., got str": {"weights": "ones"},
+    "template: 4 vertices, but weights for 5": {"weights": torch.ones(5, 2)},
+}
+
+
+@pytest.mark.parametrize("problem", SPOILT_TEMPLATES)
+def test_a_spoilt_template_in_a_file_is_refused(store, problem):
+    content = new_system(store, "smpl_nn").to_dict()
+    content["template"] = {"vertices": torch.zeros(4, 3), "weights": torch.ones(4, 2)}
+    Avatar.from_dict(content)
+    content["template"] |= SPOILT_TEMPLATES[problem]
+    with pytest.raises(UserError, match=f"does not describe an avatar of this version .{problem}"):
+        Avatar.from_dict(content)
+    content["template"] = None
+    with pytest.raises(UserError, match="model smpl_nn needs a template, got NoneType"):
+        Avatar.from_dict(content)
+
+
+def test_gradients_reach_the_pose_through_the_base_mesh(store):
+    avatar = new_system(store, "smpl_nn")
+    transforms = avatar.bone_transforms(POSES).requires_grad_()
+    avatar.model(torch.rand(2, 20, 3), transforms, POSES).logits.sum().backward()
+    assert float(transforms.grad.abs().max()) > 0
 
 
 def test_what_a_system_lacks_is_refused(store):

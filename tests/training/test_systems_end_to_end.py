@@ -115,6 +115,16 @@ def test_fields_of_the_grid_are_for_fast_snarf(config_for):
     assert not Path(config.output_root).exists()
 
 
+def test_settings_of_a_system_that_cannot_be_used_are_refused(config_for):
+    config = config_for("snarf")
+    with pytest.raises(UserError, match="model=snarf has no cells to search; leave search out"):
+        run(replace(config, search=SearchConfig("complete")))
+    for name, value in (("part_points", 0), ("part_width", 0), ("part_code", -1), ("part_weight", math.nan)):
+        with pytest.raises(UserError, match=f"model.{name} must be at least"):
+            run(replace(config, model=ModelConfig("nasa", **{name: value})))
+    assert not Path(config.output_root).exists()
+
+
 @pytest.mark.parametrize("what", ["loss", "gradient"])
 def test_a_diverged_run_stops_keeps_its_checkpoint_and_says_so(config_for, monkeypatch, what):
     config = config_for("fast_snarf", steps=12)

@@ -61,9 +61,9 @@ def draw_systems(plan: Plan, results: Sequence[Result], folder: Path, resolution
     for row, truth, camera in zip(rows, truths, cameras, strict=True):
         row.append(render(truth, camera, _PANEL))
     for _, result in progress(shown, desc="drawing systems", unit="systems"):
-        avatar = Avatar.load(result.job.folder)
+        avatar = _load(result)
         for row, truth, camera, (_, sequence, index) in zip(rows, truths, cameras, frames, strict=True):
-            mesh = _predicted(avatar, sequence, index, resolution)
+            mesh = None if avatar is None else _predicted(avatar, sequence, index, resolution)
             floor_y = float(truth.vertices[:, 1].min())
             row.append(None if mesh is None else render(mesh, camera, _PANEL, floor_y=floor_y))
     where = {"id": "in distribution", "ood": "out of distribution"}
@@ -96,8 +96,8 @@ def draw_weights(plan: Plan, results: Sequence[Result], folder: Path, resolution
         pictures.append(render(truth, camera, _PANEL))
         labels.append("the body's own")
     for row, result in shown:
-        avatar = Avatar.load(result.job.folder)
-        if not (avatar.model.has_skinning_weights and avatar.model.has_canonical_shape):
+        avatar = _load(result)
+        if avatar is None or not (avatar.model.has_skinning_weights and avatar.model.has_canonical_shape):
             continue
         try:
             mesh = canonical_surface(avatar, avatar.skeleton.canonical_pose.float(), resolution)
@@ -162,7 +162,7 @@ def draw_stick_shapes(plan: Plan, results: Sequence[Result], folder: Path) -> tu
         trained = {result.job.row: result for result in of_subject if "train" in result.files}
         if trained:
             avatars = {
-                row.label: Avatar.load(trained[row.key].job.folder) if row.key in trained else None
+                row.label: _load(trained[row.key]) if row.key in trained else None
                 for row in plan.experiment.rows
             }
             rows += extreme_poses(_store(next(iter(trained.values())), "ood"), subject, avatars)
@@ -208,6 +208,15 @@ def _trained(plan: Plan, results: Sequence[Result]) -> list[tuple[Row, Result]]:
     chosen = max(counts, key=lambda key: counts[key])  # the first of several equals
     of_row = {result.job.row: result for result in trained if (result.job.subject, result.job.seed) == chosen}
     return [(row, of_row[row.key]) for row in plan.experiment.rows if row.key in of_row]
+
+
+def _load(result: Result) -> Avatar | None:
+    """Return a run's avatar; None, with a warning, if it cannot be read: its place in a figure stays empty."""
+    try:
+        return Avatar.load(result.job.folder)
+    except UserError as error:
+        log.warning("warning: nothing to draw of %s: %s", result.job.name, error)
+        return None
 
 
 def _store(result: Result, split: str) -> SampleStore:

@@ -125,7 +125,8 @@ class _Stages:
             return replace(self.before, seconds={})
         for samples in self.job.samples:
             if not _are_there(samples.folder):
-                with locked(Path(f"{samples.folder}.lock"), self._check):
+                place = Path(samples.folder)
+                with locked(place.with_name(f".{place.name}.lock"), self._check):
                     if not _are_there(samples.folder) and not self._stage("samples", samples.arguments):
                         return self.status
         if not self.status.trained:

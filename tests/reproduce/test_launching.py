@@ -30,7 +30,8 @@ def test_a_launcher_brings_every_job_to_its_end(name, tmp_path, monkeypatch):
     seen = []
     processes = 2 if name == "joblib" else 1
     statuses = launch(jobs, tmp_path / "work", Launcher(name, processes), lambda *change: seen.append(change))
-    assert [status.state for status in statuses] == ["done", "done"]
+    said = [path.read_text() for path in tmp_path.glob("work/*/launcher.log")]
+    assert [status and status.state for status in statuses] == ["done", "done"], (statuses, said)
     assert {number for number, status in seen if status.state == "done"} == {0, 1} and len(seen) <= 4
     assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs", "work"}, "nothing is left behind elsewhere"
 

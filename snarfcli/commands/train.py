@@ -172,6 +172,10 @@ def _check(config: TrainConfig) -> None:
     check_choice("condition.name", config.condition.name, CONDITIONS)
     for name in ("width", "depth"):
         check_number(f"shape.{name}", getattr(config.shape, name), 1)
+    if config.condition.name != "none":
+        check_number("condition.layer", config.condition.layer, 0, config.shape.depth - 1)
+        for name, size in (("condition.size", config.condition.size), ("shape.condition_size", config.shape.condition_size)):
+            check_number(name, size, 1)
     check_choice("model.name", config.model.name, SYSTEMS)
     for name, least in _LEAST_OF_PARTS.items():
         check_number(f"model.{name}", getattr(config.model, name), least)

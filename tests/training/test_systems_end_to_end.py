@@ -22,6 +22,7 @@ from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.models.avatar import SYSTEMS, Avatar, load_checkpoint
 from snarfcli.models.settings import ModelConfig
+from snarfcli.shape import ConditionConfig
 from snarfcli.training import trainer as trainer_module
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Diverged
 
@@ -122,6 +123,12 @@ def test_settings_of_a_system_that_cannot_be_used_are_refused(config_for):
     for name, value in (("part_points", 0), ("part_width", 0), ("part_code", -1), ("part_weight", math.nan)):
         with pytest.raises(UserError, match=f"model.{name} must be at least"):
             run(replace(config, model=ModelConfig("nasa", **{name: value})))
+    config = config_for("fast_snarf")
+    for condition in (ConditionConfig("local", layer=config.shape.depth), ConditionConfig("global", layer=-1)):
+        with pytest.raises(UserError, match=f"condition.layer must be between 0 and {config.shape.depth - 1}"):
+            run(replace(config, condition=condition))
+    with pytest.raises(UserError, match="condition.size must be at least 1, got 0"):
+        run(replace(config, condition=ConditionConfig("local", size=0)))
     assert not Path(config.output_root).exists()
 
 

@@ -32,9 +32,10 @@ class ShapeConfig:
     frequencies: list[float] = field(default_factory=list)
     """Angular frequencies of a sine and cosine encoding of the point, per metre; none for the bare point."""
     condition_layer: int | None = 6
-    """Layer that the pose condition enters; null for a shape without pose condition."""
+    """Layer that the pose condition enters, where condition.layer does not say another (it does with condition=local); null
+    for a shape without pose condition."""
     condition_size: int = 8
-    """Size of the code that the pose is reduced to before it enters."""
+    """Size of the code that the pose is reduced to before it enters, where condition.size does not say another."""
     condition_at_start: bool = True
     """Whether the pose has an influence from the start; false starts from a shape that is the same in every pose."""
     geometric_init: bool = True

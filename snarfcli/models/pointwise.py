@@ -108,6 +108,9 @@ class PosedNetwork(nn.Module):
             nn.init.zeros_(layers[-1].bias)
         if config.skinning.weight_norm:
             layers = [nn.utils.parametrizations.weight_norm(layer) for layer in layers]
+            if starts_at_zero:  # small by its length alone: the first step would turn a short direction to anywhere
+                with torch.no_grad():
+                    layers[-1].parametrizations.weight.original1.mul_(1e4 / config.skinning.width**0.5)
         self.layers = nn.ModuleList(layers)
         self.register_buffer("scale", torch.tensor(float(scale)))
 

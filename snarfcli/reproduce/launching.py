@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import logging
 import os
 import secrets
 import signal
@@ -31,6 +32,8 @@ from snarfcli.reproduce.plans import Job
 from snarfcli.settings import quote
 
 __all__ = ["LAUNCHERS", "Launcher", "check_launcher", "launch", "run_planned_job"]
+
+log = logging.getLogger(__name__)
 
 LAUNCHERS = ("basic", "joblib", "submitit_local", "submitit_slurm")
 """What can distribute jobs: one after the other, processes of this machine, submitit's on this machine or a cluster."""
@@ -90,8 +93,8 @@ def launch(
     work = folder / secrets.token_hex(4)
     work.mkdir(parents=True)
     write_json(work / "plan.json", {"slots": _slots(launcher), "jobs": [asdict(job) for job in jobs]})
-    log = work / "launcher.log"
-    with log.open("w") as file:
+    said = work / "launcher.log"
+    with said.open("w") as file:
         process = subprocess.Popen(
             [sys.executable, "-m", "snarfcli", *_arguments(work, len(jobs), launcher)],
             stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
@@ -116,9 +119,13 @@ def launch(
             look()
             raise
     look()
-    if not seen:
-        lines = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
-        raise UserError(f"launcher={launcher.name} started no job: {lines[-1] if lines else 'it said nothing'}; see {log}")
+    left = [number for number in range(len(jobs)) if number not in seen or seen[number].state == "running"]
+    if left:
+        lines = [line.strip() for line in said.read_text(errors="replace").splitlines() if line.strip()]
+        why = f"{lines[-1] if lines else 'it said nothing'}; see {said}"
+        if not seen:
+            raise UserError(f"launcher={launcher.name} started no job: {why}")
+        log.warning("warning: launcher=%s ended before %d of %d jobs did: %s", launcher.name, len(left), len(jobs), why)
     return [seen.get(number) for number in range(len(jobs))]
 
 

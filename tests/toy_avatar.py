@@ -27,6 +27,8 @@ class ToyAvatar:
     The posed field is that of the nearest preimage by fixed-point iteration, which has one root for moderate bends.
     """
 
+    has_skinning_weights = True
+
     def __init__(self, num_joints: int = 2, radius: float = RADIUS) -> None:
         rest = torch.zeros(num_joints, 3)
         rest[1:, 0] = LENGTH

@@ -217,7 +217,7 @@ def _check(config: AnimateConfig) -> tuple[int, int]:
 
 def _check_system(config: AnimateConfig, avatar: Avatar) -> None:
     """Refuse what needs skinning weights of an avatar without any."""
-    if avatar.model.has_skinning_weights:
+    if avatar.has_skinning_weights:
         return
     wanted = "surface=skinned" if config.surface == "skinned" else "weight_colors=true" if config.weight_colors else None
     if wanted:
@@ -306,7 +306,7 @@ def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
 
 def _canonical(config: AnimateConfig, avatar: Avatar, motion: Motion) -> Mesh | None:
     """Return the canonical body in the first pose, for colours and camera; None without need or if there is none."""
-    if not (config.video or config.weight_colors) or not avatar.model.has_skinning_weights:
+    if not (config.video or config.weight_colors) or not avatar.has_skinning_weights:
         return None
     resolution = min(128, config.resolution) if config.weight_colors else min(64, config.resolution)
     try:

@@ -29,7 +29,7 @@ def measure_weights(avatar: Avatar, template: Template | None) -> dict[str, Any]
         avatar: the avatar.
         template: mesh and true weights in the canonical pose.
     """
-    if template is None or not avatar.model.has_skinning_weights:
+    if template is None or not avatar.has_skinning_weights:
         return None
     vertices = torch.as_tensor(np.asarray(template.vertices), dtype=torch.float32)
     learned = torch.cat([avatar.skinning_weights(part).cpu() for part in vertices.split(_POINTS_AT_ONCE)])

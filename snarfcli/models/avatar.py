@@ -142,6 +142,11 @@ class Avatar:
         """Where the avatar computes."""
         return self.model.grid.lower.device
 
+    @property
+    def has_skinning_weights(self) -> bool:
+        """Whether canonical points have skinning weights, so that a canonical mesh can be moved."""
+        return self.model.has_skinning_weights
+
     # ---------------------------------------------------------------- the field
     def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
         """Return the bone transforms [B, J, 4, 4], canonical to posed, of pose [B, J, 3] and translation [B, 3]."""

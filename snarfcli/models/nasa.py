@@ -14,17 +14,23 @@ from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import invert_rigid
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.skinning import skin
+from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import FieldSamples, MeshTemplate
 from snarfcli.precision import network_precision
+from snarfcli.segments import distance_to_segments
+from snarfcli.shape.network import LOGITS_PER_METRE
 
 __all__ = ["Nasa", "PartNetworks"]
 
 _LEAK = 0.1  # slope of the leaky ReLU for negative values (Deng et al.)
 _ON_SURFACE = 0.5  # wanted occupancy of a part at its own surface points (Deng et al.)
 _POINTS_AT_ONCE = {"cpu": 1024, "cuda": 65_536}  # each is evaluated for every part; on a CPU small calls stay in the cache
-_UNIT_M = 0.5  # lengths are divided by it before they enter a network
+# Lengths are divided by these before they enter a network. Points: half the length of a part; with half metres the surface IoU
+# after 300 quick steps was 56 %, with this 63 %. The root joint in a bone's frame: how far it is away.
+_UNIT_M = 0.15
+_ROOT_UNIT_M = 0.5
 
 
 class Nasa(PointwiseSystem):
@@ -35,7 +41,8 @@ class Nasa(PointwiseSystem):
     surface point to the part with the largest true skinning weight. The loss that fills the bones applies where the pose moves
     them. With `model.part_code=0` parts are rigid, which Deng et al. call NASA (R); otherwise they deform, NASA (D).
 
-    Occupancies are learned by cross-entropy, as in all systems here; the paper has squared errors.
+    Occupancies are learned by cross-entropy, as in all systems here; the paper has squared errors. Where the canonical shape of
+    the other systems corrects capsules around the bones (`shape.prior_radius_m`), each part corrects those of its own bone.
 
     Arguments: as `PointwiseSystem`.
     """
@@ -52,6 +59,7 @@ class Nasa(PointwiseSystem):
         template: MeshTemplate | None = None,
     ) -> None:
         super().__init__(config, skeleton, grid, surface, template)
+        self.register_buffer("_segments", _own_segments(skeleton), persistent=False)
         self.register_buffer("_vertices", None if template is None else template.vertices.clone(), persistent=False)
         self.register_buffer("_vertex_weights", None if template is None else template.weights.clone(), persistent=False)
 
@@ -83,8 +91,17 @@ class Nasa(PointwiseSystem):
         for part in points.split(max(1, _POINTS_AT_ONCE[points.device.type] // len(points)), 1):
             local = part[:, None] @ inverse[..., :3].transpose(-1, -2) + inverse[..., None, :, 3]
             with network_precision(precision, points.device):
-                logits.append(self.shape(local / _UNIT_M, code / _UNIT_M).to(points.dtype))
+                logits.append(self.shape(local / _UNIT_M, code / _ROOT_UNIT_M).to(points.dtype))
+            if self.config.shape.prior_radius_m is not None:
+                logits[-1] = logits[-1] + self._capsules(local)
         return torch.cat(logits, 2)
+
+    @torch.no_grad()
+    def _capsules(self, local: Tensor) -> Tensor:
+        """Return the logits [B, J, N] of the capsules around each part's own segments at points in its frame [B, J, N, 3]."""
+        own = zip(local.unbind(1), self._segments, strict=True)
+        distance = torch.stack([distance_to_segments(x.flatten(0, 1), segments).view(x.shape[:2]) for x, segments in own], 1)
+        return LOGITS_PER_METRE * (self.config.shape.prior_radius_m - distance)
 
     def bone_logits(
         self, points: Tensor, owner: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
@@ -108,6 +125,15 @@ class Nasa(PointwiseSystem):
         wanted = _ON_SURFACE * F.one_hot(weights.argmax(1), self.num_bones).T.to(weights)
         occupancy = self.part_logits(posed, bone_transforms, precision).sigmoid()
         return {"parts": config.part_weight * F.mse_loss(occupancy, wanted.expand_as(occupancy))}
+
+
+def _own_segments(skeleton: Skeleton) -> Tensor:
+    """Return the segments that move with each joint, relative to it, [J, S, 2, 3], metres; some more than once, to be S."""
+    segments, owner = weight_segments(skeleton)
+    own = [[one for one, joint in zip(segments, owner, strict=True) if joint == bone] for bone in range(skeleton.num_joints)]
+    most = max(len(some) for some in own)
+    padded = torch.stack([torch.stack(some + [some[0]] * (most - len(some))) for some in own])
+    return padded - skeleton.canonical_joints[:, None, None]
 
 
 class PartNetworks(nn.Module):
@@ -137,8 +163,8 @@ class PartNetworks(nn.Module):
         """Return the logits [B, J, N] at points [B, J, N, 3] in the frames of the bones.
 
         Args:
-            local: the points, in half metres.
-            roots: the root joint in the frames of the bones, [B, J, 3], in half metres: the pose.
+            local: the points, in units of `_UNIT_M`.
+            roots: the root joint in the frames of the bones, [B, J, 3], in units of `_ROOT_UNIT_M`: the pose.
         """
         batch, bones, count = local.shape[:3]
         code = torch.einsum("bp,jpc->bjc", roots.flatten(1), self.reduce)

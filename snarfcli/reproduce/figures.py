@@ -97,7 +97,7 @@ def draw_weights(plan: Plan, results: Sequence[Result], folder: Path, resolution
         labels.append("the body's own")
     for row, result in shown:
         avatar = _load(result)
-        if avatar is None or not (avatar.model.has_skinning_weights and avatar.model.has_canonical_shape):
+        if avatar is None or not (avatar.has_skinning_weights and avatar.model.has_canonical_shape):
             continue
         try:
             mesh = canonical_surface(avatar, avatar.skeleton.canonical_pose.float(), resolution)

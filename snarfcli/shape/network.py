@@ -11,10 +11,11 @@ from torch.nn import functional as F
 
 from snarfcli.segments import distance_to_segments
 
-__all__ = ["OccupancyNetwork", "ShapeConfig"]
+__all__ = ["LOGITS_PER_METRE", "OccupancyNetwork", "ShapeConfig"]
 
 _SOFTPLUS_SHARPNESS = 100.0  # as in the papers' code
-_LOGITS_PER_METRE = 30.0  # slope of the capsule prior across the surface
+LOGITS_PER_METRE = 30.0
+"""Slope of a capsule prior across its surface."""
 
 
 @dataclass
@@ -133,7 +134,7 @@ class OccupancyNetwork(nn.Module):
         logits = h[:, 0]
         if self.config.prior_radius_m is not None:
             distance = distance_to_segments(canonical, self.bones)
-            logits = logits + _LOGITS_PER_METRE * (self.config.prior_radius_m - distance)
+            logits = logits + LOGITS_PER_METRE * (self.config.prior_radius_m - distance)
         return logits
 
     def _local_code(self, condition: Tensor, pose: Tensor, seen: Tensor) -> Tensor:

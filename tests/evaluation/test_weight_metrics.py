@@ -33,9 +33,9 @@ def test_the_avatar_is_asked_at_the_canonical_vertices():
         assert torch.equal(points, torch.tensor(vertices, dtype=torch.float32))
         return torch.tensor(TRUE)
 
-    avatar = SimpleNamespace(model=SimpleNamespace(has_skinning_weights=True), skinning_weights=weights_at)
+    avatar = SimpleNamespace(has_skinning_weights=True, skinning_weights=weights_at)
     template = Template(vertices, np.zeros((0, 3), np.int32), TRUE)
     assert measure_weights(avatar, template)["wrong_share"] == 0
     assert measure_weights(avatar, None) is None
-    without = SimpleNamespace(model=SimpleNamespace(has_skinning_weights=False))
+    without = SimpleNamespace(has_skinning_weights=False)
     assert measure_weights(without, template) is None

@@ -185,6 +185,22 @@ def test_a_part_moves_with_its_bone_and_deforms_or_not(store, name, deforms):
     torch.testing.assert_close(union, avatar.model.part_logits(moved, transforms).amax(1).detach())
 
 
+def test_parts_start_as_capsules_around_their_bones(store):
+    avatar = new_system(store, "nasa", as_it_starts=True)
+    transforms = avatar.bone_transforms(POSES)
+    points = points_near(avatar, transforms, 100)
+    with torch.no_grad():
+        with_capsules = avatar.model.part_logits(points, transforms)
+        avatar.config.shape.prior_radius_m = None
+        capsules = with_capsules - avatar.model.part_logits(points, transforms)
+    joints = avatar.skeleton.canonical_joints
+    posed = torch.einsum("bjrc,jc->bjr", transforms[:, :, :3, :3], joints) + transforms[:, :, :3, 3]
+    along = (posed[:, 1] - posed[:, 0])[:, None]  # the first part has the bone, the last one the point where it ends
+    share = (((points - posed[:, :1]) * along).sum(-1) / (along * along).sum(-1)).clamp(0, 1)[..., None]
+    distances = torch.stack([(points - posed[:, :1] - share * along).norm(dim=-1), (points - posed[:, 1:]).norm(dim=-1)], 1)
+    torch.testing.assert_close(capsules, 30.0 * (0.07 - distances), atol=1e-3, rtol=0)
+
+
 def test_surface_points_belong_to_one_part(store):
     avatar = new_system(store, "nasa", part_weight=2.0, part_points=64)
     template, generator = template_of(store), torch.Generator().manual_seed(3)

@@ -85,7 +85,7 @@ def test_every_system_trains_evaluates_and_moves(config_for, name, tmp_path):
     assert len(meshes) == (2 if code == 0 else len(meshes))  # a field without a surface is reported by the exit code
     assert code == 0 or name in ("pose_onet", "nasa", "piecewise")  # whose fields start from nothing
     avatar = Avatar.load(folder)
-    if not avatar.model.has_skinning_weights:
+    if not avatar.has_skinning_weights:
         for wish in ({"surface": "skinned"}, {"weight_colors": True}):
             with pytest.raises(UserError, match=f"needs skinning weights of canonical points, which model {name}"):
                 animate.run(animate_config(config, tmp_path / "pose.npz", overwrite=True, **wish))

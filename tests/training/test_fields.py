@@ -34,7 +34,7 @@ def config_for(store, tmp_path, caplog):
     caplog.set_level(logging.INFO, "snarfcli")
 
     def make(name: str, softmax: str = "plain", **training) -> TrainConfig:
-        parts = avatar_config(max_steps=20)
+        parts = avatar_config(capsules=True, max_steps=20)
         skinning = replace(parts.skinning, name=name, softmax=softmax)
         search = parts.search
         if name == "voxel":
@@ -73,7 +73,7 @@ def test_trains_saves_evaluates_and_poses(config_for, name, softmax):
         Path(config.skinning.weights_file).unlink()  # the avatar is whole without it
     avatar = Avatar.load(Path(config.output_root) / "builtin" / "toy" / name)
     evaluate(eval_config(config))
-    points = torch.tensor([[0.0, 0.02, 0.01], [0.4, 0.0, 0.0], [0.9, 0.03, 0.0]])
+    points = torch.tensor([[0.0, 0.02, 0.01], [0.2, 0.0, 0.0], [0.45, 0.03, 0.0]])
     weights = avatar.skinning_weights(points)
     torch.testing.assert_close(weights.sum(1), torch.ones(3))
     pose = torch.tensor([[0.0, 0.0, 0.3], [0.0, 0.0, 0.5]])
@@ -83,8 +83,11 @@ def test_trains_saves_evaluates_and_poses(config_for, name, softmax):
         found = avatar.model.deformer(posed[None], transforms)
     for query, point in enumerate(points):
         assert float((found.canonical[found.query == query] - point).norm(dim=1).min()) < 1e-3
-    lower, upper = avatar.posed_box(transforms[0])
-    assert bool((posed >= lower).all()) and bool((posed <= upper).all())
+    box_c = avatar.canonical_box()
+    anywhere = box_c[0] + torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) * (box_c[1] - box_c[0])
+    inside = anywhere[avatar.canonical_logits(anywhere, avatar.skeleton.canonical_pose) > 0]
+    posed, (lower, upper) = avatar.skin(inside, transforms[0]), avatar.posed_box(transforms[0])
+    assert len(inside) and bool((posed >= lower).all()) and bool((posed <= upper).all())
     for surface in ("field", "skinned"):
         assert len(avatar.mesh(pose, resolution=24, surface=surface).faces) > 20
 

@@ -329,6 +329,9 @@ def _config_message(chain: list[BaseException]) -> str:
     key = re.search(r"full_key: ([\w.]+)", text)
     if unfit and key:
         return f"{key.group(1)} wants {_TYPE_NAMES.get(unfit.group(2), unfit.group(2))}, got '{unfit.group(1)}'"
+    single = re.search(r"override (\S+?)=(\S*).*is not a ListConfig", text)
+    if single:
+        return f"{single.group(1)} wants a list, got {single.group(2)}; write {single.group(1)}=[{single.group(2)}]"
     lines = dict.fromkeys(" ".join(str(link).strip().splitlines()[0].split()) for link in chain if str(link).strip())
     return ": ".join(list(lines)[:2])
 

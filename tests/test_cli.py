@@ -152,3 +152,9 @@ def test_setting_names_are_dotted():
 
     names = setting_names(TrainConfig)
     assert {"subject", "training", "training.steps", "search.init_bones"} <= set(names)
+
+
+def test_a_list_given_as_one_word_is_told_how_to_write_it(capsys):
+    assert main(["reproduce", "table1", "--dry-run", "subjects=50002"]) == 2
+    error = capsys.readouterr().err
+    assert error == "snarf reproduce: subjects wants a list, got 50002; write subjects=[50002]\n"

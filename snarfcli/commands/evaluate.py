@@ -96,7 +96,7 @@ def run(config: EvalConfig) -> None:
         try:
             avatar.model.choose_search(with_start_bones(config.search, avatar.skeleton))
         except ValueError as error:
-            raise UserError(f"{error}; leave search out, or give search=snarf for weights that are searched directly") from None
+            raise UserError(f"{error}; leave search out, or give search=snarf for an avatar of model=snarf") from None
     search = avatar.model.search
     folder = path.parent / _folder_name(config, avatar)
     _check_writable(folder)

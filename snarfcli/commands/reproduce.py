@@ -16,7 +16,7 @@ from omegaconf import MISSING
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.train import TrainConfig
 from snarfcli.errors import UserError
-from snarfcli.reproduce.jobs import Status
+from snarfcli.reproduce.jobs import Status, read_status
 from snarfcli.reproduce.launching import LAUNCHERS, Launcher, check_launcher, launch
 from snarfcli.reproduce.plans import Choice, Job, Plan, choose_experiments, make_plan, unique_jobs
 from snarfcli.reproduce.report import write_report
@@ -44,11 +44,11 @@ class ReproduceConfig:
     seeds: list[int] = MISSING
     """Seeds; with several the tables have standard deviations."""
     training: str | None = MISSING
-    """Training preset of all systems; null: quick, and stick2d for the 2D stick."""
+    """Training preset; null: quick, and stick2d for the 2D stick, which keeps it with all."""
     data: str | None = MISSING
     """Data set; null: builtin, stick2d or clothed. Licensed ones: dfaust (with PosePrior), cape for the clothed experiment."""
     systems: list[str] = MISSING
-    """Rows of the table to make; empty: all."""
+    """Rows of the table to make, by the names that --dry-run prints, such as [nasa,ours-local]; empty: all."""
     extra: list[str] = MISSING
     """Further settings of every training, such as [training.steps=1000]; such runs have folders of their own."""
     data_root: str = MISSING
@@ -116,6 +116,9 @@ def run(config: ReproduceConfig) -> int:
         of_plan = [collect(job) for job in plan.jobs]
         results += of_plan
         log.info("\n%s\n\n%s\n", plan.experiment.title, plain_table(plan, of_plan))
+        undone = sum(result.state != "done" for result in of_plan)
+        if undone:
+            log.warning("warning: %d of %d runs are not done, so the exit code is 1; the report says why", undone, len(of_plan))
         resolution = config.figure_resolution if config.figures else None
         about = f"{launcher.processes} runs at a time" if launcher.processes > 1 else ""
         for path in write_report(plan, of_plan, folder, _command(config), about=about, figure_resolution=resolution):
@@ -189,7 +192,7 @@ def _print_plan(jobs: Sequence[Job]) -> None:
     """Print each run and the commands that make it."""
     made: set[str] = set()
     for number, job in enumerate(jobs, 1):
-        log.info("run %d of %d: %s, %s", number, len(jobs), job.name, job.folder)
+        log.info("run %d of %d: %s: %s, %s", number, len(jobs), job.row, job.name, job.folder)
         for samples in job.samples:
             if samples.folder not in made and not (Path(samples.folder) / "manifest.json").exists():
                 log.info("  snarf %s", " ".join(samples.arguments))
@@ -207,7 +210,7 @@ def _command(config: ReproduceConfig) -> str:
     defaults = OmegaConf.to_container(OmegaConf.load(config_folder() / "reproduce" / "reproduce.yaml"))
     words = ["snarf", "reproduce", str(config.what)]
     for name, value in asdict(config).items():
-        if name != "what" and value != defaults[name]:
+        if name not in ("what", "only_report", "dry_run") and value != defaults[name]:
             word = f"{name}={_written(value)}"
             words.append(word if re.fullmatch(r"[\w.,=/:+\-\[\]]*", word) else shlex.quote(word))
     return " ".join(words)
@@ -254,9 +257,14 @@ class _Progress:
         seconds = sum(status.seconds.values())
         return ", ".join([*parts, "IoU in/out of distribution", f"{seconds:.0f} s" if seconds else "was there already"])
 
+    @staticmethod
+    def _is_there(job: Job) -> bool:
+        status = read_status(Path(job.folder))
+        return status is not None and status.state == "done" and status.digest == job.digest
+
     def _left(self) -> str:
         """Return about how long the rest takes, by the mean of the runs that took time."""
-        left = len(self.jobs) - len(self._ended)
+        left = sum(number not in self._ended and not self._is_there(job) for number, job in enumerate(self.jobs))
         if not left or not self._worked_s:
             return ""
         seconds = sum(self._worked_s) / len(self._worked_s) * left / min(self.processes, left)

@@ -54,22 +54,29 @@ def markdown_runs(plan: Plan, results: Sequence[Result], link: Link, columns: Se
 
 
 def plain_table(plan: Plan, results: Sequence[Result]) -> str:
-    """Return the main table for a terminal, without the times of its parts; the papers' numbers in brackets."""
+    """Return the main table for a terminal, without the times of its parts; the papers' numbers in brackets.
+
+    With one subject these are its own, where the paper has them, else the means.
+    """
+    subject = plan.subjects[0] if len(plan.subjects) == 1 else None
     columns = [column for column in COLUMNS if column.key not in ("search_ms", "shape_ms", "total_ms")]
     rows = [["", *(column.title for column in columns)]]
     for row in plan.experiment.rows:
-        of_row, paper = _of(results, row, None), paper_numbers(plan.experiment.name, row.paper)
+        of_row, paper = _of(results, row, None), paper_numbers(plan.experiment.name, row.paper, subject)
         texts = [summarise(of_row, column).text(column.digits) for column in columns]
         papers = [f" ({paper[column.key]:g})" if column.key in paper else "" for column in columns]
         rows.append([row.label, *(text + other for text, other in zip(texts, papers, strict=True))])
     widths = [max(len(line[index]) for line in rows) for index in range(len(rows[0]))]
-    return "\n".join(
+    lines = [
         "  ".join(
             text.ljust(width) if index == 0 else text.rjust(width)
             for index, (text, width) in enumerate(zip(line, widths, strict=True))
         ).rstrip()
         for line in rows
-    )
+    ]
+    if any("(" in text for line in rows[1:] for text in line[1:]):
+        lines.append("in brackets: the paper's number, of other data")
+    return "\n".join(lines)
 
 
 def csv_table(plan: Plan, results: Sequence[Result], link: Link) -> str:
@@ -122,7 +129,7 @@ def order_lines(plan: Plan, results: Sequence[Result]) -> list[str]:
             continue
         difference = first.mean - second.mean
         noise = _noise(first, second)
-        known = "" if noise is None else f", standard deviation over seeds {noise:.1f}"
+        known = " (one seed: its noise is not known)" if noise is None else f", standard deviation over seeds {noise:.1f}"
         verdict = "holds" if difference >= 0 else "within noise" if noise and -difference <= noise else "does not hold"
         lines.append(f"{pair}: {difference:+.1f} points{known}: {verdict}")
     return lines

@@ -155,6 +155,6 @@ def test_setting_names_are_dotted():
 
 
 def test_a_list_given_as_one_word_is_told_how_to_write_it(capsys):
-    assert main(["reproduce", "table1", "--dry-run", "subjects=50002"]) == 2
+    assert cli.main(["reproduce", "table1", "--dry-run", "subjects=50002"]) == 2
     error = capsys.readouterr().err
     assert error == "snarf reproduce: subjects wants a list, got 50002; write subjects=[50002]\n"

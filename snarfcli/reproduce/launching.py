@@ -31,7 +31,7 @@ from snarfcli.reproduce.locks import one_of
 from snarfcli.reproduce.plans import Job
 from snarfcli.settings import quote
 
-__all__ = ["LAUNCHERS", "Launcher", "check_launcher", "launch", "run_planned_job"]
+__all__ = ["LAUNCHERS", "Launcher", "check_launcher", "is_installed", "launch", "run_planned_job"]
 
 log = logging.getLogger(__name__)
 
@@ -64,13 +64,21 @@ def check_launcher(launcher: Launcher) -> None:
         UserError: it is not, or more than one process is wanted from one that has one.
     """
     package = _PACKAGES.get(launcher.name)
-    if package and importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher") is None:
+    if package and not is_installed(package):
         raise UserError(
             f"launcher={launcher.name} needs hydra-{package}-launcher; install it with: pip install 'snarf[{package}]' "
             f"(or pip install hydra-{package}-launcher)"
         )
     if launcher.name == "basic" and launcher.processes > 1:
         raise UserError(f"launcher=basic runs one job at a time, got processes={launcher.processes}; give launcher=joblib too")
+
+
+def is_installed(package: str) -> bool:
+    """Return whether Hydra's launcher joblib or submitit is installed."""
+    try:
+        return importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher") is not None
+    except ModuleNotFoundError:  # no plugin of Hydra is
+        return False
 
 
 def launch(

@@ -21,7 +21,7 @@ from snarfcli.reproduce.launching import Launcher, check_launcher, launch, run_p
 
 @pytest.mark.parametrize("name", ["basic", "joblib"])
 def test_a_launcher_brings_every_job_to_its_end(name, tmp_path, monkeypatch):
-    if name != "basic" and importlib.util.find_spec(f"hydra_plugins.hydra_{name}_launcher") is None:
+    if name != "basic" and not launching.is_installed(name):
         pytest.skip(f"hydra-{name}-launcher is not installed")
     monkeypatch.chdir(tmp_path)
     jobs = fake_plan(tmp_path, systems=("snarf", "nasa")).jobs
@@ -71,8 +71,13 @@ def test_ctrl_c_stops_jobs_and_waits_for_them(tmp_path, monkeypatch):
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
-def test_launchers_that_are_not_installed_name_what_to_install(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+@pytest.mark.parametrize("any_plugin", [True, False])
+def test_launchers_that_are_not_installed_name_what_to_install(monkeypatch, any_plugin):
+    def find_spec(name):
+        if not any_plugin:  # as importlib does where even the package around the module is missing
+            raise ModuleNotFoundError(f"No module named {name.partition('.')[0]!r}")
+
+    monkeypatch.setattr(importlib.util, "find_spec", find_spec)
     check_launcher(Launcher())
     with pytest.raises(UserError, match=r"needs hydra-joblib-launcher; install it with: pip install 'snarf\[joblib\]'"):
         check_launcher(Launcher("joblib", 2))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -227,7 +226,6 @@ class _Progress:
 
     def __init__(self, jobs: Sequence[Job], processes: int) -> None:
         self.jobs, self.processes = jobs, processes
-        self.start = time.monotonic()
         self.done = 0
         self._ended: set[int] = set()
         self._worked_s: list[float] = []

@@ -7,7 +7,6 @@ from torch import Tensor
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.models.pointwise import PointwiseSystem, PosedNetwork, into_root_frame
-from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import MeshTemplate, pose_angles
 
 __all__ = ["BackD"]
@@ -22,17 +21,9 @@ class BackD(PointwiseSystem):
     Arguments: as `PointwiseSystem`.
     """
 
-    def __init__(
-        self,
-        config: AvatarConfig,
-        skeleton: Skeleton,
-        grid: CanonicalGrid,
-        surface: Tensor,
-        template: MeshTemplate | None = None,
-    ) -> None:
-        super().__init__(config, skeleton, grid, surface, template)
+    def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         scale = float((grid.upper - grid.lower).max()) / 2
-        self.displacement = PosedNetwork(3 * (skeleton.num_joints - 1), 3, config, scale, starts_at_zero=True)
+        self.displacement = PosedNetwork(3 * (skeleton.num_joints - 1), 3, self.config, scale, starts_at_zero=True)
 
     def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, None]:
         rooted = into_root_frame(points, bone_transforms)

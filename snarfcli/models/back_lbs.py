@@ -13,7 +13,6 @@ from snarfcli.deformer import BonePrior, CanonicalGrid
 from snarfcli.deformer.hierarchy import make_softmax
 from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, PosedNetwork, into_root_frame, invert_blended, move_with_bones
-from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import MeshTemplate, pose_angles
 from snarfcli.shape import CONDITIONS
 
@@ -31,22 +30,14 @@ class BackLBS(PointwiseSystem):
 
     conditions: ClassVar[tuple[str, ...]] = CONDITIONS
 
-    def __init__(
-        self,
-        config: AvatarConfig,
-        skeleton: Skeleton,
-        grid: CanonicalGrid,
-        surface: Tensor,
-        template: MeshTemplate | None = None,
-    ) -> None:
-        super().__init__(config, skeleton, grid, surface, template)
-        skinning, joints = config.skinning, skeleton.num_joints
+    def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
+        skinning, joints = self.config.skinning, skeleton.num_joints
         self.softmax = make_softmax(skinning.softmax, joints, skeleton.parents)
         falloff = skinning.prior_falloff_m
         self.prior = None if falloff is None else BonePrior(*weight_segments(skeleton), joints, falloff)
         scale = float((grid.upper - grid.lower).max()) / 2
         self.weight_network = PosedNetwork(
-            3 * (joints - 1), self.softmax.num_logits, config, scale, starts_at_zero=falloff is not None
+            3 * (joints - 1), self.softmax.num_logits, self.config, scale, starts_at_zero=falloff is not None
         )
 
     def posed_weights(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Tensor:

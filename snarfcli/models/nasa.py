@@ -16,7 +16,7 @@ from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
-from snarfcli.models.settings import AvatarConfig, ModelConfig
+from snarfcli.models.settings import ModelConfig
 from snarfcli.models.system import FieldSamples, MeshTemplate
 from snarfcli.precision import network_precision
 from snarfcli.segments import distance_to_segments
@@ -50,15 +50,7 @@ class Nasa(PointwiseSystem):
     needs_template: ClassVar[bool] = True
     has_canonical_shape: ClassVar[bool] = False
 
-    def __init__(
-        self,
-        config: AvatarConfig,
-        skeleton: Skeleton,
-        grid: CanonicalGrid,
-        surface: Tensor,
-        template: MeshTemplate | None = None,
-    ) -> None:
-        super().__init__(config, skeleton, grid, surface, template)
+    def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         self.register_buffer("_segments", _own_segments(skeleton), persistent=False)
         self.register_buffer("_vertices", None if template is None else template.vertices.clone(), persistent=False)
         self.register_buffer("_vertex_weights", None if template is None else template.weights.clone(), persistent=False)

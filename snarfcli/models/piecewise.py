@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
-from torch import Tensor
-
-from snarfcli.bodies import Skeleton
-from snarfcli.deformer import CanonicalGrid
 from snarfcli.models.nasa import Nasa
 from snarfcli.models.settings import AvatarConfig
-from snarfcli.models.system import MeshTemplate
 
 __all__ = ["Piecewise"]
 
@@ -21,12 +17,5 @@ class Piecewise(Nasa):
     Arguments: as `Nasa`; `model.part_code` is 0 whatever is given.
     """
 
-    def __init__(
-        self,
-        config: AvatarConfig,
-        skeleton: Skeleton,
-        grid: CanonicalGrid,
-        surface: Tensor,
-        template: MeshTemplate | None = None,
-    ) -> None:
-        super().__init__(replace(config, model=replace(config.model, part_code=0)), skeleton, grid, surface, template)
+    def __init__(self, config: AvatarConfig, *others: Any, **named: Any) -> None:
+        super().__init__(replace(config, model=replace(config.model, part_code=0)), *others, **named)

@@ -51,6 +51,10 @@ class PointwiseSystem(System):
         self.register_buffer("upper", grid.upper.clone())
         self.register_buffer("reach", distance_to_segments(surface, bones).max() + _BOX_MARGIN_M)
         self.register_buffer("_joints", skeleton.canonical_joints.clone(), persistent=False)
+        self._build(skeleton, grid, template)
+
+    def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
+        """Make what the system has besides its shape; the arguments are those of the constructor."""
 
     def forward(
         self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"

@@ -12,7 +12,6 @@ from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.pointwise import PointwiseSystem, invert_blended
-from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import MeshTemplate
 from snarfcli.shape import CONDITIONS
 
@@ -34,15 +33,7 @@ class SmplNN(PointwiseSystem):
     has_skinning_weights: ClassVar[bool] = True
     conditions: ClassVar[tuple[str, ...]] = CONDITIONS
 
-    def __init__(
-        self,
-        config: AvatarConfig,
-        skeleton: Skeleton,
-        grid: CanonicalGrid,
-        surface: Tensor,
-        template: MeshTemplate | None = None,
-    ) -> None:
-        super().__init__(config, skeleton, grid, surface, template)
+    def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         self.register_buffer("vertices", template.vertices.clone(), persistent=False)
         self.register_buffer("vertex_weights", template.weights.clone(), persistent=False)
 

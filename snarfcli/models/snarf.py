@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
-from torch import Tensor
-
-from snarfcli.bodies import Skeleton
-from snarfcli.deformer import CanonicalGrid
 from snarfcli.models.fast_snarf import FastSnarf
 from snarfcli.models.settings import AvatarConfig
-from snarfcli.models.system import MeshTemplate
 
 __all__ = ["Snarf"]
 
@@ -22,14 +17,5 @@ class Snarf(FastSnarf):
     Arguments: as `FastSnarf`; `skinning.name` is "mlp" whatever is given, and `search.name` must be "broyden".
     """
 
-    def __init__(
-        self,
-        config: AvatarConfig,
-        skeleton: Skeleton,
-        grid: CanonicalGrid,
-        surface: Tensor,
-        template: MeshTemplate | None = None,
-        field: Callable[[Tensor], Tensor] | None = None,
-    ) -> None:
-        skinning = replace(config.skinning, name="mlp")
-        super().__init__(replace(config, skinning=skinning), skeleton, grid, surface, template, field)
+    def __init__(self, config: AvatarConfig, *others: Any, **named: Any) -> None:
+        super().__init__(replace(config, skinning=replace(config.skinning, name="mlp")), *others, **named)

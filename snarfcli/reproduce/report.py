@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
 from functools import partial
@@ -21,7 +20,6 @@ __all__ = ["write_report"]
 
 log = logging.getLogger(__name__)
 
-_LARGEST_COPY_BYTES = 30_000
 _COPIES = {"train": "train.json", "id": "eval_id.json", "ood": "eval_ood.json"}
 _DRAWN = {"table1": ("systems", "weights"), "table2": ("weights",), "ablations": (), "clothed": ("systems",)}
 
@@ -161,14 +159,13 @@ def _figures_text(figures: Sequence[tuple[Path, str]], folder: Path) -> str:
 
 
 def _copy(result: Result, folder: Path) -> dict[str, str]:
-    """Copy the files of a run into the report; return where they are, relative to it. Large ones lose their frames."""
+    """Copy the files of a run into the report; return where they are, relative to it; without the numbers of single frames."""
     links = {}
     for stage, path in result.files.items():
         relative = Path("runs") / result.job.subject / Path(result.job.folder).name / _COPIES[stage]
         content = read_json(path, "metrics")
-        if len(json.dumps(content, indent=2)) > _LARGEST_COPY_BYTES:
-            for sequence in content.get("sequences", {}).values():
-                sequence.pop("per_frame", None)
+        for sequence in content.get("sequences", {}).values():
+            sequence.pop("per_frame", None)
         write_json(folder / relative, content)
         links[stage] = relative.as_posix()
     return links

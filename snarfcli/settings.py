@@ -53,13 +53,16 @@ def group_schemas(schema: type) -> dict[str, type]:
 
 
 def describe(schema: type) -> Iterator[tuple[str, str]]:
-    """Yield the name of each plain field of a dataclass and the docstring below it."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(schema))).body[0].body  # type: ignore[attr-defined]
+    """Yield the name of each plain field of a dataclass, its bases' first, and the docstring below it."""
     texts: dict[str, str] = {}
-    for field, below in zip(body, body[1:], strict=False):
-        is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) and isinstance(below.value.value, str)
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
-            texts[field.target.id] = " ".join(below.value.value.split())
+    for owner in reversed([kind for kind in schema.__mro__ if dataclasses.is_dataclass(kind)]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
+        for field, below in zip(body, body[1:], strict=False):
+            is_text = (
+                isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) and isinstance(below.value.value, str)
+            )
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and is_text:
+                texts[field.target.id] = " ".join(below.value.value.split())
     nested = group_schemas(schema)
     for field in dataclasses.fields(schema):
         if field.name not in nested:

@@ -28,6 +28,7 @@ class ToyAvatar:
     """
 
     has_skinning_weights = True
+    device = torch.device("cpu")
 
     def __init__(self, num_joints: int = 2, radius: float = RADIUS) -> None:
         rest = torch.zeros(num_joints, 3)

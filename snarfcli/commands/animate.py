@@ -7,20 +7,22 @@ import logging
 import math
 import re
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from omegaconf import MISSING
 
-from snarfcli.bodies import Skeleton
 from snarfcli.checks import check_choice, check_number
-from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject
-from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.stored_motion import stored_motion
+from snarfcli.commands.choices import (
+    AvatarChoice,
+    ChosenMotion,
+    MotionChoice,
+    check_motion_choice,
+    choose_motion,
+    load_chosen_avatar,
+)
 from snarfcli.errors import UserError
 from snarfcli.export.animation import Animation
 from snarfcli.export.meshes import MESH_WRITERS
@@ -31,65 +33,28 @@ from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import SURFACES, canonical_surface
 from snarfcli.models.avatar import Avatar
-from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, Motion, builtin_motion, read_motion
-from snarfcli.motions.layouts import HANDS, SMPL, layout_of
-from snarfcli.motions.world import UPS
-from snarfcli.runs import choose_device, find_avatar, machine_facts, run_folder, set_threads
+from snarfcli.motions import Motion
+from snarfcli.runs import machine_facts
 
 __all__ = ["AnimateConfig", "run"]
 
 log = logging.getLogger(__name__)
 
-_MOTION = "jumping_jacks"
-_BUILTIN_MOTIONS = (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES)
 _RECORD = "animation.json"
 _VIDEO = "video.mp4"
 _RESOLUTIONS = (16, 1024)  # dense lattices: 1024 take some 4 GB for a body with its arms spread
-_FRAME_RATES = (1.0, 1000.0)
 _LARGEST_PICTURE = 4096
 
 
 @dataclass
-class AnimateConfig:
+class AnimateConfig(MotionChoice, AvatarChoice):
     """Settings of `snarf animate`."""
 
-    subject: str = MISSING
-    """Whose avatar, such as 50002."""
-    data: DataConfig = MISSING
-    """Which data the avatar was trained on."""
-    data_root: str = MISSING
-    """Folder with the processed samples, whose motions are for skeletons that the built-in ones do not fit."""
-    output_root: str = MISSING
-    """Folder with the runs; the avatar is <output_root>/<data>/<subject>/<run>/avatar.pt."""
-    run: str = MISSING
-    """Name of the run."""
-    ckpt: str | None = MISSING
-    """Avatar file or run folder to use instead; results go beside it."""
     pose: str | None = MISSING
     """Motion: .npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf, or a folder of frames; null for the built-in `motion`."""
-    up: str = MISSING
-    """Which way is up in the pose file: auto, y or z."""
-    hands: str = MISSING
-    """SMPL's hand joints where the pose file has fingers: rest (straight) or released (as the released code took them)."""
-    mapping: str | None = MISSING
-    """For .bvh and .glb: JSON file {joint of the avatar: joint of the pose file}; null goes by the usual names."""
-    clip: str | None = MISSING
-    """For .bvh and .glb: name or number of the animation; null for the first."""
     motion: str | None = MISSING
     """Without a pose file: a built-in motion of SMPL's joints, or a sequence of the samples of any other skeleton; null for
     jumping_jacks, or for the held-out sequence."""
-    motion_seed: int = MISSING
-    """Variant of the built-in motion."""
-    motion_frame_rate: float = MISSING
-    """Frames a second of the built-in motion."""
-    start: int = MISSING
-    """First frame."""
-    stop: int | None = MISSING
-    """Frame to stop before; null for the end."""
-    step: int = MISSING
-    """Take every so many frames; the video keeps the pace."""
-    max_frames: int | None = MISSING
-    """Stop after so many frames; null for all."""
     surface: str = MISSING
     """field (the union, watertight) or skinned (the canonical mesh moved by its skin)."""
     resolution: int = MISSING
@@ -114,10 +79,6 @@ class AnimateConfig:
     """Folder for the results; null for animation/<motion> beside the avatar."""
     overwrite: bool = MISSING
     """Start again, even over frames made with other settings."""
-    device: str = MISSING
-    """auto, cpu, cuda or cuda:N."""
-    threads: int | None = MISSING
-    """Threads for tensor work; null leaves PyTorch's choice."""
     experiment: str | None = None
     """Name of the preset of settings that the rest starts from; null for none."""
 
@@ -132,23 +93,14 @@ def run(config: AnimateConfig) -> int:
         UserError: there is no avatar or no motion, or a setting cannot be used.
     """
     size = _check(config)
-    trained_on = config.data.avatars or config.data.name
-    subject_folder = run_folder(config.output_root, trained_on, config.subject, config.run).parent
-    unknown = config.data.name == "builtin" and config.subject not in BUILTIN_SUBJECTS
-    if unknown and config.ckpt is None and not subject_folder.exists():
-        builtin_subject(config.subject)  # says which name is near
-    path = find_avatar(config.output_root, trained_on, config.subject, config.run, config.ckpt)
-    device = choose_device(config.device)
-    set_threads(config.threads)
-    avatar = Avatar.load(path, device)
+    avatar, path = load_chosen_avatar(config)
     _check_system(config, avatar)
-    whole, transforms = _read(config, avatar.skeleton)
-    motion, numbers = _selected(config, whole)
-    transforms = None if transforms is None else transforms[numbers]
+    chosen = choose_motion(config, config, avatar.skeleton, config.pose, config.motion)
+    motion, numbers, transforms = chosen.motion, chosen.numbers, chosen.bone_transforms
     folder = Path(config.output) if config.output else path.parent / "animation" / _file_name(motion.name)
-    settings = _settings(config, path, whole, numbers)
+    settings = _settings(config, path, chosen)
     _prepare(folder, settings, config.overwrite)
-    log.info("avatar: %s, on %s", path, device)
+    log.info("avatar: %s, on %s", path, avatar.device)
     log.info("motion: %s, %d frames at %g a second", motion.name, motion.num_frames, motion.frame_rate)
 
     start = time.perf_counter()
@@ -195,13 +147,11 @@ def run(config: AnimateConfig) -> int:
 
 def _check(config: AnimateConfig) -> tuple[int, int]:
     """Refuse settings that cannot be used, before any work starts; return the size of the video."""
-    for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("up", UPS), ("hands", HANDS)):
+    for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS))):
         check_choice(name, getattr(config, name), choices)
-    for name, least in (("step", 1), ("max_frames", 1), ("motion_seed", 0)):
-        check_number(name, getattr(config, name), least)
+    check_motion_choice(config)
     check_number("resolution", config.resolution, *_RESOLUTIONS)
     check_number("keep_share", config.keep_share, 0, 1)
-    check_number("motion_frame_rate", config.motion_frame_rate, *_FRAME_RATES)
     check_number("azimuth_deg", config.azimuth_deg, -360, 360)
     check_number("elevation_deg", config.elevation_deg, -89, 89)
     if not (config.meshes or config.video):
@@ -227,49 +177,23 @@ def _check_system(config: AnimateConfig, avatar: Avatar) -> None:
         )
 
 
-def _read(config: AnimateConfig, skeleton: Skeleton) -> tuple[Motion, NDArray[np.float32] | None]:
-    """Return the whole motion, with y up, and its bone transforms where the poses do not say it all."""
-    if config.pose is not None:
-        motion = read_motion(
-            config.pose, skeleton, up=config.up, hands=config.hands, mapping=config.mapping, clip=config.clip
-        )
-        return motion, None
-    is_smpl = layout_of(skeleton) == SMPL
-    if not is_smpl and config.data.name != "builtin" and config.motion not in _BUILTIN_MOTIONS:
-        return stored_motion(config.data_root, config.data.name, config.subject, config.motion, skeleton)
-    motion = builtin_motion(config.motion or _MOTION, config.motion_seed, frame_rate=config.motion_frame_rate)
-    if not is_smpl:
-        raise UserError(
-            f"motion {motion.name} is for SMPL's 24 joints, the avatar has {skeleton.num_joints} of another kind;"
-            " give a motion of its own by --pose FILE, such as .bvh, .glb or .npz"
-        )
-    return motion, None
-
-
-def _selected(config: AnimateConfig, motion: Motion) -> tuple[Motion, list[int]]:
-    """Return the frames asked for and their numbers in the motion."""
-    numbers = list(range(*slice(config.start, config.stop, config.step).indices(motion.num_frames)))[: config.max_frames]
-    if not numbers:
-        raise UserError(
-            f"start={config.start}, stop={config.stop} leave no frame: {motion.name} has frames 0 to {motion.num_frames - 1}"
-        )
-    poses, translation = motion.poses[numbers], motion.translation[numbers]
-    return replace(motion, poses=poses, translation=translation, frame_rate=motion.frame_rate / config.step), numbers
-
-
 def _file_name(name: str) -> str:
     """Return a motion's name as a folder's."""
     return re.sub(r"[^\w.+-]+", "_", name).strip(".") or "motion"
 
 
-def _settings(config: AnimateConfig, avatar: Path, whole: Motion, numbers: list[int]) -> dict[str, Any]:
+def _settings(config: AnimateConfig, avatar: Path, chosen: ChosenMotion) -> dict[str, Any]:
     """Return what the frames depend on: frames of other settings must not be mixed with them."""
+    # Of the frames, only which the first one is and how far they are apart: more of the same motion can be made later.
+    whole = chosen.whole
     digest = hashlib.sha256(whole.poses.tobytes() + whole.translation.tobytes())
     return {
         "avatar_sha256": hashlib.sha256(avatar.read_bytes()).hexdigest(),
         "motion_sha256": digest.hexdigest(),
-        "start": numbers[0],
+        "start": chosen.first,
         "step": config.step,
+        "frame_rate": config.frame_rate,
+        "in_place": config.in_place,
         "surface": config.surface,
         "resolution": config.resolution,
         "keep_share": config.keep_share,

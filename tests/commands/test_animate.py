@@ -14,11 +14,12 @@ import trimesh
 from toy_avatar import LENGTH, RADIUS, ToyAvatar
 
 from snarfcli.cli import main
-from snarfcli.commands import animate
+from snarfcli.commands import animate, choices
 from snarfcli.commands.animate import AnimateConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.meshing.extract import EmptySurface
+from snarfcli.models.avatar import Avatar
 from snarfcli.motions import Motion
 
 VOLUME = np.pi * RADIUS**2 * 2 * LENGTH + 4 / 3 * np.pi * RADIUS**3
@@ -27,7 +28,7 @@ VOLUME = np.pi * RADIUS**2 * 2 * LENGTH + 4 / 3 * np.pi * RADIUS**3
 @pytest.fixture
 def toy(monkeypatch) -> ToyAvatar:
     avatar = ToyAvatar()
-    monkeypatch.setattr(animate.Avatar, "load", classmethod(lambda cls, path, device: avatar))
+    monkeypatch.setattr(Avatar, "load", classmethod(lambda cls, path, device: avatar))
     return avatar
 
 
@@ -65,7 +66,9 @@ def config(tmp_path: Path, pose_file: Path, toy: ToyAvatar) -> AnimateConfig:
         start=0,
         stop=None,
         step=1,
+        frame_rate=None,
         max_frames=None,
+        in_place=False,
         surface="field",
         resolution=32,
         keep_share=0.01,
@@ -307,7 +310,7 @@ def test_another_skeleton_moves_as_its_samples_do(config, toy, tmp_path, monkeyp
         asked.append(arguments[1:4])
         return motion, transforms
 
-    monkeypatch.setattr(animate, "stored_motion", stored)
+    monkeypatch.setattr(choices, "stored_motion", stored)
     other = replace(config, data=DataConfig("meshes", 1, 1, 1), pose=None, motion=None, ckpt=str(tmp_path / "avatar.pt"))
     (tmp_path / "avatar.pt").write_bytes(b"the toy")
     assert run(replace(other, output=str(tmp_path / "out"))) == 0

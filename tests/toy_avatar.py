@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.bodies import Skeleton
+from snarfcli.meshing.skinned import SkinnedSurface
 
 RADIUS = 0.1
 LENGTH = 0.5
@@ -78,3 +79,6 @@ class ToyAvatar:
         tips = torch.tensor([[0.0, 0, 0], [LENGTH, 0, 0], [2 * LENGTH, 0, 0]])
         moved = self.skin(tips, bone_transforms)
         return moved.amin(0) - 0.2, moved.amax(0) + 0.2
+
+    def skinned_surface(self, resolution: int = 256, keep_share: float = 0.01) -> SkinnedSurface:
+        return SkinnedSurface(self, resolution, keep_share=keep_share)

@@ -2,7 +2,8 @@
 
 from snarfcli.meshing.extract import EmptySurface, FullSurface, extract_surface
 from snarfcli.meshing.mesh import ExtractionStats, Mesh, vertex_normals
-from snarfcli.meshing.surfaces import SURFACES, canonical_surface, field_surface, posed_mesh, skinned_surface
+from snarfcli.meshing.skinned import SkinnedSurface
+from snarfcli.meshing.surfaces import SURFACES, canonical_surface, field_surface, posed_mesh
 
 __all__ = [
     "SURFACES",
@@ -10,10 +11,10 @@ __all__ = [
     "ExtractionStats",
     "FullSurface",
     "Mesh",
+    "SkinnedSurface",
     "canonical_surface",
     "extract_surface",
     "field_surface",
     "posed_mesh",
-    "skinned_surface",
     "vertex_normals",
 ]

@@ -1,19 +1,32 @@
-"""The two surfaces of a posed avatar: the field's own, and the canonical mesh moved by its skin."""
+"""Surfaces of an avatar: that of its posed field, and the canonical one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from snarfcli.bodies import Skeleton
 from snarfcli.meshing.extract import extract_surface
 from snarfcli.meshing.mesh import Mesh
 
-__all__ = ["SURFACES", "AvatarLike", "canonical_surface", "field_surface", "posed_mesh", "skinned_surface"]
+if TYPE_CHECKING:
+    from snarfcli.meshing.skinned import SkinnedSurface
+
+__all__ = [
+    "SURFACES",
+    "AvatarLike",
+    "canonical_surface",
+    "check_posed",
+    "field_surface",
+    "in_chunks",
+    "limited",
+    "posed_mesh",
+]
 
 SURFACES = ("field", "skinned")
 
@@ -28,6 +41,8 @@ _NEIGHBOURS = 8
 class AvatarLike(Protocol):
     """What the surfaces need of an avatar, which moves what it is given to its device itself."""
 
+    skeleton: Skeleton
+
     def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor: ...
 
     def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor): ...
@@ -41,6 +56,8 @@ class AvatarLike(Protocol):
     def canonical_box(self) -> tuple[Tensor, Tensor]: ...
 
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]: ...
+
+    def skinned_surface(self, resolution: int, keep_share: float) -> SkinnedSurface: ...
 
 
 @torch.no_grad()
@@ -71,11 +88,11 @@ def field_surface(
     Raises:
         EmptySurface, FullSurface: the field has no surface.
     """
-    pose, transforms = _posed(avatar, pose, translation, transforms)
+    pose, transforms = check_posed(avatar, pose, translation, transforms)
     lower, upper = avatar.posed_box(transforms)
 
     def posed_logits(points: Tensor) -> Tensor:
-        return avatar.query(points[None], transforms[None], pose[None]).logits[0].clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+        return limited(avatar.query(points[None], transforms[None], pose[None]).logits[0])
 
     mesh = extract_surface(
         posed_logits, lower, upper, resolution, widen=True, keep_share=keep_share, chunk=chunk
@@ -100,33 +117,11 @@ def canonical_surface(
     lower, upper = avatar.canonical_box()
 
     def canonical_logits(points_c: Tensor) -> Tensor:
-        return avatar.canonical_logits(points_c, pose).clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+        return limited(avatar.canonical_logits(points_c, pose))
 
     mesh = extract_surface(canonical_logits, lower, upper, resolution, widen=True, keep_share=keep_share, chunk=chunk)
-    weights = _in_chunks(avatar.skinning_weights, mesh.vertices)
+    weights = in_chunks(avatar.skinning_weights, mesh.vertices)
     return replace(mesh, weights=weights).with_normals()
-
-
-@torch.no_grad()
-def skinned_surface(
-    avatar: AvatarLike,
-    pose: Tensor,
-    translation: Tensor | None = None,
-    resolution: int = 256,
-    *,
-    keep_share: float = 0.01,
-    chunk: int = 65536,
-    transforms: Tensor | None = None,
-) -> Mesh:
-    """Extract the canonical surface under the condition of `pose` and move it by linear blend skinning.
-
-    The mesh keeps its canonical topology, so it may cross itself where the body touches itself, and carries its weights.
-
-    Args and raises: as `field_surface`; `resolution` counts along the longest side of the canonical box.
-    """
-    pose, transforms = _posed(avatar, pose, translation, transforms)
-    mesh_c = canonical_surface(avatar, pose, resolution, keep_share=keep_share, chunk=chunk)
-    return replace(mesh_c, vertices=_skin(avatar, transforms, mesh_c.vertices), normals=None).with_normals()
 
 
 def posed_mesh(
@@ -151,11 +146,11 @@ def posed_mesh(
             avatar, pose, translation, resolution, weights_from=weights_from, keep_share=keep_share, transforms=transforms
         )
     if surface == "skinned":
-        return skinned_surface(avatar, pose, translation, resolution, keep_share=keep_share, transforms=transforms)
+        return avatar.skinned_surface(resolution, keep_share).posed(pose, translation, transforms)
     raise ValueError(f"surface: wanted one of {', '.join(SURFACES)}, got {surface!r}")
 
 
-def _posed(
+def check_posed(
     avatar: AvatarLike, pose: Tensor, translation: Tensor | None, transforms: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Check the arguments; return the pose as float32 and the bone transforms [J, 4, 4]."""
@@ -172,11 +167,16 @@ def _posed(
     return pose, avatar.bone_transforms(pose[None], translation)[0]
 
 
+def limited(logits: Tensor) -> Tensor:
+    """Return logits within what is said about a place near a surface."""
+    return logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
+
+
 def _skin(avatar: AvatarLike, transforms: Tensor, vertices_c: np.ndarray) -> np.ndarray:
-    return _in_chunks(lambda points_c: avatar.skin(points_c, transforms), vertices_c)
+    return in_chunks(lambda points_c: avatar.skin(points_c, transforms), vertices_c)
 
 
-def _in_chunks(function: Callable[[Tensor], Tensor], points: np.ndarray, chunk: int = 65536) -> np.ndarray:
+def in_chunks(function: Callable[[Tensor], Tensor], points: np.ndarray, chunk: int = 65536) -> np.ndarray:
     """Call `function` on parts of `points` [N, 3] and return the joined results as float32."""
     parts = [function(part).cpu() for part in torch.from_numpy(points).split(chunk)]
     return torch.cat(parts).float().numpy()

@@ -29,6 +29,7 @@ from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, MeshTemplate
 
 if TYPE_CHECKING:
     from snarfcli.meshing.mesh import Mesh
+    from snarfcli.meshing.skinned import SkinnedSurface
 
 __all__ = ["SYSTEMS", "Avatar", "load_checkpoint"]
 
@@ -80,6 +81,7 @@ class Avatar:
         self.template = template if system.keeps_template else None
         options = {} if field is None else {"field": field}
         self.model = system(config, skeleton, grid, surface, template, **options)
+        self._skinned: dict[tuple[int, float], SkinnedSurface] = {}
 
     # ---------------------------------------------------------------- files
     def save(self, path: str | Path) -> None:
@@ -135,6 +137,7 @@ class Avatar:
         """Move the avatar to a device and freeze there what does not depend on the pose."""
         self.model.to(device)
         self.model.freeze()
+        self._skinned.clear()
         return self
 
     @property
@@ -208,29 +211,42 @@ class Avatar:
         """Return the corners (lower [3], upper [3]) of a box that holds the whole body in one pose [J, 4, 4], metres."""
         return self.model.posed_box(bone_transforms.to(self.device))
 
+    def skinned_surface(self, resolution: int = 256, keep_share: float = 0.01) -> SkinnedSurface:
+        """Return the canonical mesh that `mesh(surface="skinned")` poses; it is made once and remembered.
+
+        Args:
+            resolution: voxels along the longest side of the canonical box.
+            keep_share: loose pieces with fewer faces than this share of the largest surface's are dropped.
+
+        Raises:
+            ValueError: the system has no skinning weights, or the field has no surface.
+        """
+        from snarfcli.meshing.skinned import SkinnedSurface
+
+        if (resolution, keep_share) not in self._skinned:
+            self._skinned[resolution, keep_share] = SkinnedSurface(self, resolution, keep_share=keep_share)
+        return self._skinned[resolution, keep_share]
+
     def mesh(
         self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field"
     ) -> Mesh:
-        """Extract the posed mesh of one pose.
+        """Return the posed mesh of one pose.
 
         Args:
             pose: [J, 3] or [1, J, 3] axis-angle, radians, global orientation included.
             translation: [3] or [1, 3], metres.
             resolution: voxels along the longest side.
             surface: "field" (the union of all correspondences, watertight) or "skinned" (the canonical mesh moved by
-                linear blend skinning, with its weights).
+                linear blend skinning, with its weights; after the first one nearly for free, always with the same faces).
 
         Raises:
             ValueError: `surface` is neither, the system cannot skin a surface, or the field has none in this pose.
         """
-        from snarfcli.meshing.surfaces import field_surface, skinned_surface
+        from snarfcli.meshing.surfaces import posed_mesh
 
-        surfaces = {"field": field_surface, "skinned": skinned_surface}
-        if surface not in surfaces:
-            raise ValueError(f"surface must be 'field' or 'skinned', got {surface!r}")
         pose = torch.as_tensor(pose).reshape(-1, 3)
         translation = None if translation is None else torch.as_tensor(translation).reshape(3)
-        return surfaces[surface](self, pose, translation, resolution=resolution)
+        return posed_mesh(self, pose, translation, resolution, surface=surface)
 
 
 def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | None:

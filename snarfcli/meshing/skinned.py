@@ -1,0 +1,178 @@
+"""The skinned surface: one canonical mesh, made once, that follows the pose-dependent shape and is moved by its skin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from snarfcli.meshing.mesh import Mesh, vertex_normals
+from snarfcli.meshing.surfaces import AvatarLike, canonical_surface, check_posed, in_chunks
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+__all__ = ["SkinnedSurface"]
+
+# The motion of the shape with the pose is found at the vertices of a coarser mesh, 2 cm apart on a body, and interpolated:
+# against finding it at every vertex of a mesh of 256, 0.2 mm in the mean (benchmarks/bm_surfaces.py).
+_CONTROL_RESOLUTION = 96
+_STEPS = 8
+_REACHED_M = 1e-4  # a step this short ends the search; 1.5 evaluations a point suffice in the mean
+_LOST_M = 1e-3  # a point whose last step was longer has no level set along its normal
+_SLOPE_M = 0.002  # half the distance over which the slope along a normal is measured
+_LEAST_SLOPE = 3.0  # logits a metre; what is flatter shows no surface to follow
+_LONGEST_STEP_M = 0.01
+_FARTHEST_M = 0.03  # that the pose may move a point of the canonical surface along its normal
+_FILLINGS = 20  # rounds in which lost points take the mean of their neighbours
+
+
+class SkinnedSurface:
+    """A canonical mesh of an avatar that is made once and posed again and again, always with the same faces.
+
+    In each pose the vertices move along their canonical normals onto the level set of the shape of that pose, and then as
+    linear blend skinning says, with the weights that they have in `mesh`: a rig can do the same.
+
+    Args:
+        avatar: gives the canonical shape and the skinning weights.
+        resolution: cells along the longest side of the canonical box.
+        keep_share: see `extract_surface`.
+        mesh: canonical mesh to use instead, a decimated one for instance; its vertices are moved onto the level set first,
+            and get the weights that they have there.
+
+    Raises:
+        EmptySurface, FullSurface: the canonical field has no surface.
+        ValueError: the avatar has no skinning weights.
+
+    Source: S Eq. 2 (the level set of the shape under the condition of a pose) and S Eq. 4.
+    """
+
+    def __init__(
+        self, avatar: AvatarLike, resolution: int = 256, *, keep_share: float = 0.01, mesh: Mesh | None = None
+    ) -> None:
+        self._avatar = avatar
+        rest = avatar.skeleton.canonical_pose.float()
+        fine = canonical_surface(avatar, rest, resolution, keep_share=keep_share) if mesh is None else mesh
+        self.mesh = fine = _settled(avatar, rest, fine)
+        """The canonical mesh, in the shape of the skeleton's canonical pose, with weights [V, J] and normals."""
+        coarse = None
+        if mesh is not None or resolution > _CONTROL_RESOLUTION:
+            coarse = _settled(avatar, rest, canonical_surface(avatar, rest, _CONTROL_RESOLUTION, keep_share=keep_share))
+        if coarse is None or len(coarse.vertices) >= len(fine.vertices):
+            self._control, self._corners, self._shares = _Followed(avatar, rest, fine), None, None
+        else:
+            self._control = _Followed(avatar, rest, coarse)
+            self._corners, self._shares = _nearest_points(fine.vertices, coarse)
+
+    @torch.no_grad()
+    def canonical_vertices(self, pose: Tensor) -> NDArray[np.float32]:
+        """Return the vertices [V, 3], canonical frame, metres, on the level set of the shape in `pose` [J, 3]."""
+        way = self._control.ways(pose.float())
+        if self._corners is not None:
+            way = np.einsum("vc,vc->v", way[self._corners], self._shares)
+        return self.mesh.vertices + way[:, None] * self.mesh.normals
+
+    @torch.no_grad()
+    def posed(self, pose: Tensor, translation: Tensor | None = None, transforms: Tensor | None = None) -> Mesh:
+        """Return the mesh in one pose, with weights and normals.
+
+        Args:
+            pose: [J, 3] axis-angle, radians, global orientation included.
+            translation: [3] metres.
+            transforms: [J, 4, 4] canonical to posed, metres, instead of those of the pose; for joints that stretch.
+        """
+        pose, transforms = check_posed(self._avatar, pose, translation, transforms)
+        vertices = _skin(self.canonical_vertices(pose), self.mesh.weights, transforms.cpu().numpy())
+        return replace(self.mesh, vertices=vertices, normals=vertex_normals(vertices, self.mesh.faces))
+
+
+class _Followed:
+    """Points of the canonical surface that are followed along their normals as the pose changes the shape."""
+
+    def __init__(self, avatar: AvatarLike, pose: Tensor, mesh: Mesh) -> None:
+        self.avatar = avatar
+        self.points = mesh.vertices
+        self.normals = mesh.normals
+        self.neighbours = _neighbours(mesh)
+        every = np.arange(len(self.points))
+        ahead, behind = (self.logits(pose, every, np.full(len(every), way, np.float32)) for way in (_SLOPE_M, -_SLOPE_M))
+        self.slope = np.minimum((ahead - behind) / (2 * _SLOPE_M), -_LEAST_SLOPE)  # logits fall towards the outside
+
+    def logits(self, pose: Tensor, index: NDArray[np.int64], way: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the logits [K] at some of the points [K], moved so far along their normals [K], in a pose."""
+        points_c = self.points[index] + way[:, None] * self.normals[index]
+        return in_chunks(lambda part: self.avatar.canonical_logits(part, pose), points_c)
+
+    def ways(self, pose: Tensor) -> NDArray[np.float32]:
+        """Return how far along its normal each point meets the level set, [C], metres: Newton's method, then secants."""
+        way = np.zeros(len(self.points), dtype=np.float32)
+        left = np.arange(len(way))  # points still on their way
+        slope = self.slope
+        before = last = None
+        for _ in range(_STEPS):
+            value = self.logits(pose, left, way[left])
+            if last is not None:
+                # The slope of the last step, within a factor of the one at rest.
+                moved = way[left] - before
+                secant = np.divide(value - last, moved, out=slope.copy(), where=moved != 0)
+                slope = np.clip(secant, 3 * self.slope[left], self.slope[left] / 3)
+            before, last = way[left], value
+            step = np.clip(-value / slope, -_LONGEST_STEP_M, _LONGEST_STEP_M)
+            way[left] = np.clip(before + step, -_FARTHEST_M, _FARTHEST_M)
+            going = np.abs(step) > _REACHED_M
+            is_lost = np.abs(step[going]) > _LOST_M
+            left, before, last, slope = (values[going] for values in (left, before, last, slope))
+            if not len(left):
+                break
+        return self._filled(way, left[is_lost])
+
+    def _filled(self, way: NDArray[np.float32], lost: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Let points that found no level set, [L], go along with their neighbours."""
+        if len(lost):
+            way[lost] = 0
+            means = self.neighbours[lost]
+            for _ in range(_FILLINGS):
+                way[lost] = means @ way
+        return way
+
+
+def _neighbours(mesh: Mesh) -> csr_matrix:
+    """Return the matrix [V, V] that takes the mean of each vertex' neighbours."""
+    from scipy.sparse import coo_matrix, diags
+
+    start, end = mesh.faces.ravel(), mesh.faces[:, [1, 2, 0]].ravel()
+    count = len(mesh.vertices)
+    ones = np.ones(2 * len(start), dtype=np.float32)
+    joined = coo_matrix((ones, (np.concatenate([start, end]), np.concatenate([end, start]))), shape=(count, count)).tocsr()
+    joined.data[:] = 1
+    return (diags(1 / np.maximum(np.asarray(joined.sum(axis=1)).ravel(), 1)) @ joined).tocsr().astype(np.float32)
+
+
+def _settled(avatar: AvatarLike, pose: Tensor, mesh: Mesh) -> Mesh:
+    """Return a canonical mesh with its vertices on the level set of the shape in `pose`, with weights and normals."""
+    mesh = mesh.with_normals()
+    vertices = mesh.vertices + _Followed(avatar, pose, mesh).ways(pose)[:, None] * mesh.normals
+    weights = in_chunks(avatar.skinning_weights, vertices)
+    return replace(mesh, vertices=vertices, weights=weights, normals=None).with_normals()
+
+
+def _nearest_points(vertices: NDArray[np.float32], mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return the corners [V, 3] of the triangle nearest to each point [V, 3], and their shares [V, 3] in its nearest point."""
+    import igl
+
+    corners = mesh.vertices.astype(np.float64)
+    _, face, nearest = igl.point_mesh_squared_distance(vertices.astype(np.float64), corners, mesh.faces.astype(np.int64))
+    index = mesh.faces[np.asarray(face).ravel()]
+    a, b, c = (np.ascontiguousarray(corners[index[:, k]]) for k in range(3))
+    shares = igl.barycentric_coordinates(np.ascontiguousarray(nearest), a, b, c)
+    return index, np.asarray(shares, dtype=np.float32)
+
+
+def _skin(vertices: NDArray[np.float32], weights: NDArray[np.float32], transforms: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Move canonical points [V, 3] with weights [V, J] by bone transforms [J, 4, 4] (S Eq. 4)."""
+    blended = (weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
+    return np.einsum("vrc,vc->vr", blended[:, :, :3], vertices) + blended[:, :, 3]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from toy_avatar import LENGTH, RADIUS, ToyAvatar, capsule
 from torch import Tensor
+from toy_avatar import LENGTH, RADIUS, ToyAvatar, capsule
 
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.skinned import SkinnedSurface

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 import re
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import MISSING
 
@@ -23,11 +24,16 @@ from snarfcli.commands.choices import (
     choose_motion,
     load_chosen_avatar,
 )
+from snarfcli.commands.truth import true_meshes
 from snarfcli.errors import UserError
-from snarfcli.export.animation import Animation
+from snarfcli.export.animation import CONTENTS, Animation, place_canonical
 from snarfcli.export.meshes import MESH_WRITERS
-from snarfcli.export.stage import set_stage
+from snarfcli.export.panels import Screen, picture_size
+from snarfcli.export.processes import choose_processes, parse_processes
+from snarfcli.export.sheet import write_png
+from snarfcli.export.stage import CAMERAS, body_points, set_stage
 from snarfcli.export.video import write_video
+from snarfcli.export.views import View, parse_turntable, parse_views
 from snarfcli.files import read_json, write_json
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
@@ -35,6 +41,7 @@ from snarfcli.meshing.surfaces import SURFACES, canonical_surface
 from snarfcli.models.avatar import Avatar
 from snarfcli.motions import Motion
 from snarfcli.runs import machine_facts
+from snarfcli.sampling.parallel import count_cores
 
 __all__ = ["AnimateConfig", "run"]
 
@@ -42,6 +49,7 @@ log = logging.getLogger(__name__)
 
 _RECORD = "animation.json"
 _VIDEO = "video.mp4"
+_POSTER = "poster.png"
 _RESOLUTIONS = (16, 1024)  # dense lattices: 1024 take some 4 GB for a body with its arms spread
 _LARGEST_PICTURE = 4096
 
@@ -70,15 +78,27 @@ class AnimateConfig(MotionChoice, AvatarChoice):
     video: bool = MISSING
     """Whether to draw a video."""
     video_size: str = MISSING
-    """Pixels of the video: 512, or width x height such as 1280x720."""
+    """Pixels of one panel of the video: 512, or width x height such as 1280x720. Several views or contents make it larger."""
+    views: list[str] = MISSING
+    """Sides to look from, side by side: front, left, back, right (of the body), top, or degrees towards the body's left."""
     azimuth_deg: float = MISSING
-    """Where the camera stands: degrees from straight ahead of the body towards its left."""
+    """Degrees by which the cameras of all views but top are turned towards the body's left; 0 takes the views by their word."""
     elevation_deg: float = MISSING
-    """Degrees that the camera looks down."""
+    """Degrees that the camera looks down, in all views but top."""
+    camera: str = MISSING
+    """still (it sees the whole motion) or follow (it goes along with the body)."""
+    turntable: str = MISSING
+    """Whether the camera goes round the body: false, true (a turn in eight seconds), or degrees a second."""
+    beside: list[str] = MISSING
+    """What is shown beside the avatar: canonical (its canonical shape in this pose), truth (the true posed mesh, where there is
+    one), skinned or field (the other surface), weights (the skinned surface, coloured by its weights)."""
     output: str | None = MISSING
     """Folder for the results; null for animation/<motion> beside the avatar."""
     overwrite: bool = MISSING
     """Start again, even over frames made with other settings."""
+    processes: str = MISSING
+    """Processes that make frames at the same time, sharing the threads: auto (one a core as memory allows, 1 with a GPU) or a
+    number."""
     experiment: str | None = None
     """Name of the preset of settings that the rest starts from; null for none."""
 
@@ -92,11 +112,13 @@ def run(config: AnimateConfig) -> int:
     Raises:
         UserError: there is no avatar or no motion, or a setting cannot be used.
     """
-    size = _check(config)
+    plan = _check(config)
     avatar, path = load_chosen_avatar(config)
     _check_system(config, avatar)
     chosen = choose_motion(config, config, avatar.skeleton, config.pose, config.motion)
-    motion, numbers, transforms = chosen.motion, chosen.numbers, chosen.bone_transforms
+    motion, count = chosen.motion, len(chosen.numbers)
+    truth = true_meshes(config, config, avatar, chosen, config.pose) if config.video and "truth" in config.beside else None
+    processes = choose_processes(plan.processes, avatar.device, count, config.resolution)
     folder = Path(config.output) if config.output else path.parent / "animation" / _file_name(motion.name)
     settings = _settings(config, path, chosen)
     _prepare(folder, settings, config.overwrite)
@@ -110,7 +132,7 @@ def run(config: AnimateConfig) -> int:
         motion.name,
         motion.poses,
         motion.translation,
-        numbers,
+        chosen.numbers,
         surface=config.surface,
         resolution=config.resolution,
         folder=folder,
@@ -118,36 +140,42 @@ def run(config: AnimateConfig) -> int:
         weights_from=canonical,
         weight_colors=config.weight_colors,
         keep_share=config.keep_share,
-        bone_transforms=transforms,
+        bone_transforms=chosen.bone_transforms,
+        screen=_screen(config, plan, avatar, chosen, canonical) if config.video else None,
+        truth=truth,
     )
+    threads = max(1, (config.threads or count_cores()) // processes)
+    if processes > 1:
+        log.info("%d processes of %d threads", processes, threads)
+    pictures = animation.pictures(processes, threads)
     try:
         if config.video:
-            stage = set_stage(
-                avatar,
-                motion.poses,
-                motion.translation,
-                canonical,
-                aspect=size[0] / size[1],
-                azimuth_rad=math.radians(config.azimuth_deg),
-                elevation_rad=math.radians(config.elevation_deg),
-                bone_transforms=transforms,
-            )
-            write_video(folder / _VIDEO, animation.pictures(stage, size), motion.frame_rate)
+            write_video(folder / _VIDEO, _with_poster(pictures, count // 2, folder / _POSTER), motion.frame_rate)
         else:
-            for _ in animation.meshes():
+            for _ in pictures:
                 pass
     except KeyboardInterrupt:
         done = len(animation.frames)
-        log.info("stopped after %d of %d frames; the same command goes on from there", done, len(numbers))
+        log.info("stopped after %d of %d frames; the same command goes on from there", done, count)
         raise
-    record = _record(config, animation, motion, path, time.perf_counter() - start)
+    record = _record(config, animation, motion, path, processes, time.perf_counter() - start)
     write_json(folder / _RECORD, {"complete": True, "settings": settings, **record})
     return _report(config, animation, record["timings"])
 
 
-def _check(config: AnimateConfig) -> tuple[int, int]:
-    """Refuse settings that cannot be used, before any work starts; return the size of the video."""
-    for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS))):
+@dataclass(frozen=True)
+class _Plan:
+    """Settings of pictures and processes, read."""
+
+    size: tuple[int, int]
+    views: tuple[View, ...]
+    turn_rad_s: float
+    processes: int | None
+
+
+def _check(config: AnimateConfig) -> _Plan:
+    """Refuse settings that cannot be used, before any work starts."""
+    for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("camera", CAMERAS)):
         check_choice(name, getattr(config, name), choices)
     check_motion_choice(config)
     check_number("resolution", config.resolution, *_RESOLUTIONS)
@@ -162,14 +190,57 @@ def _check(config: AnimateConfig) -> tuple[int, int]:
         raise UserError(
             f"video_size must be a number such as 512 or 1280x720, 16 to {_LARGEST_PICTURE}, got {config.video_size}"
         )
-    return numbers
+    views = parse_views(config.views, config.azimuth_deg, config.elevation_deg)
+    for name in config.beside:
+        check_choice("beside", name, CONTENTS)
+        if name == config.surface:
+            raise UserError(f"beside=[{name}]: the avatar is shown as surface={name} already; take the other one")
+        if config.beside.count(name) > 1:
+            raise UserError(f"beside has '{name}' twice; name each once")
+    picture_size(numbers, 1 + len(config.beside), len(views))
+    return _Plan(numbers, views, parse_turntable(config.turntable), parse_processes(config.processes))
+
+
+def _screen(config: AnimateConfig, plan: _Plan, avatar: Avatar, chosen: ChosenMotion, canonical: Mesh | None) -> Screen:
+    """Set the stage for a motion."""
+    motion = chosen.motion
+    beside = None
+    if "canonical" in config.beside and canonical is not None:
+        beside = place_canonical(canonical.vertices, canonical, 0.0, 0.0)
+    stage = set_stage(
+        body_points(avatar, motion.poses, motion.translation, canonical, chosen.bone_transforms),
+        motion.poses,
+        plan.views,
+        frame_rate=motion.frame_rate,
+        aspect=plan.size[0] / plan.size[1],
+        camera=config.camera,
+        turn_rad_s=plan.turn_rad_s,
+        beside=beside,
+    )
+    other = {"skinned", "field"} & set(config.beside)
+    contents = {"avatar": f"{config.surface} surface" if other else "avatar"}
+    contents |= {name: CONTENTS[name] for name in config.beside}
+    return Screen(stage, plan.size, contents, settled=["canonical"])
+
+
+def _with_poster(pictures: Iterator[np.ndarray], index: int, path: Path) -> Iterator[np.ndarray]:
+    """Pass pictures on, and write one of them as PNG."""
+    for number, picture in enumerate(pictures):
+        if number == index:
+            write_png(path, picture)
+        yield picture
 
 
 def _check_system(config: AnimateConfig, avatar: Avatar) -> None:
     """Refuse what needs skinning weights of an avatar without any."""
     if avatar.has_skinning_weights:
         return
-    wanted = "surface=skinned" if config.surface == "skinned" else "weight_colors=true" if config.weight_colors else None
+    needing = [f"beside=[{name}]" for name in config.beside if name in ("canonical", "skinned", "weights")]
+    if config.weight_colors:
+        needing.insert(0, "weight_colors=true")
+    if config.surface == "skinned":
+        needing.insert(0, "surface=skinned")
+    wanted = needing[0] if needing else None
     if wanted:
         raise UserError(
             f"{wanted} needs skinning weights of canonical points, which model {avatar.config.model.name} does not have; "
@@ -218,7 +289,7 @@ def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
             what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
             raise UserError(f"{folder} holds frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
     else:
-        there = [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), *folder.glob(_VIDEO)]
+        there = [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), *folder.glob(_VIDEO), *folder.glob(_POSTER)]
         if there and not overwrite:  # without a record they are somebody else's
             raise UserError(
                 f"{folder} holds {there[0].name} of unknown origin; give overwrite=true to replace it, or output=FOLDER"
@@ -229,17 +300,22 @@ def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
 
 
 def _canonical(config: AnimateConfig, avatar: Avatar, motion: Motion) -> Mesh | None:
-    """Return the canonical body in the first pose, for colours and camera; None without need or if there is none."""
+    """Return a canonical mesh of the body, for colours and cameras; None without need or if there is none."""
     if not (config.video or config.weight_colors) or not avatar.has_skinning_weights:
         return None
-    resolution = min(128, config.resolution) if config.weight_colors else min(64, config.resolution)
     try:
+        if config.surface == "skinned" or {"skinned", "canonical", "weights"} & set(config.beside):
+            # Made here, the avatar remembers it, and takes it along to worker processes.
+            return avatar.skinned_surface(config.resolution, config.keep_share).mesh
+        resolution = min(128, config.resolution) if config.weight_colors else min(64, config.resolution)
         return canonical_surface(avatar, torch.from_numpy(motion.poses[0]).float(), resolution)
     except (EmptySurface, FullSurface):
         return None
 
 
-def _record(config: AnimateConfig, animation: Animation, motion: Motion, avatar: Path, seconds: float) -> dict[str, Any]:
+def _record(
+    config: AnimateConfig, animation: Animation, motion: Motion, avatar: Path, processes: int, seconds: float
+) -> dict[str, Any]:
     """Return the facts for `animation.json`."""
     frames = animation.frames
     return {
@@ -247,12 +323,14 @@ def _record(config: AnimateConfig, animation: Animation, motion: Motion, avatar:
         "avatar": str(avatar),
         "motion": {"name": motion.name, "frames": motion.num_frames, "frame_rate": motion.frame_rate},
         "video": _VIDEO if config.video else None,
+        "poster": _POSTER if config.video else None,
         "frames": [asdict(frame) for frame in frames],
         "skipped": [{"frame": frame.frame, "reason": frame.problem} for frame in frames if frame.problem],
         "timings": {
             "total_s": round(seconds, 3),
             "extraction_s": round(sum(frame.extraction_s for frame in frames), 3),
             "rendering_s": round(sum(frame.rendering_s for frame in frames), 3),
+            "processes": processes,
             "frames_a_second": round(len(frames) / max(seconds, 1e-9), 3),
         },
         **machine_facts(),
@@ -263,7 +341,7 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
     """Say what was made and where it is, and return the exit code."""
     frames, folder = animation.frames, animation.folder
     skipped = sum(frame.problem is not None for frame in frames)
-    kept = sum(frame.points == 0 and frame.problem is None for frame in frames)
+    kept = sum(frame.was_there for frame in frames)
     log.info(
         "%d frames in %.1f s, %.2f frames a second%s",
         len(frames), timings["total_s"], timings["frames_a_second"], f"; {kept} were there already" if kept else "",
@@ -271,7 +349,7 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
     if config.meshes and skipped < len(frames):
         log.info("meshes: %s", folder / f"frame_*.{config.format}")
     if config.video:
-        log.info("video: %s", folder / _VIDEO)
+        log.info("video: %s, and its middle as %s", folder / _VIDEO, _POSTER)
     pieces = sum(frame.components > 1 for frame in frames)
     if pieces:
         log.info("%d frames have loose pieces; keep_share=0.1 would drop all but large ones", pieces)

@@ -2,26 +2,48 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import signal
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
 
+from snarfcli.export.lighting import Solid
 from snarfcli.export.meshes import read_mesh, weights_to_colors, write_mesh
-from snarfcli.export.render import render
-from snarfcli.export.stage import Stage
+from snarfcli.export.panels import Screen
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import AvatarLike, posed_mesh
 from snarfcli.progress import progress
+from snarfcli.sampling.parallel import Worker, interrupts_held_back
 
-__all__ = ["Animation", "FrameRecord"]
+__all__ = ["CONTENTS", "Animation", "FrameRecord", "Meshes"]
 
 log = logging.getLogger(__name__)
+
+CONTENTS = {
+    "canonical": "canonical shape",
+    "truth": "ground truth",
+    "skinned": "skinned surface",
+    "field": "field surface",
+    "weights": "skinning weights",
+}
+"""What can be shown beside the avatar, and what is written below it."""
+
+_TRUTH_COLOR = (204, 178, 148)  # sRGB; clay, so that nobody takes it for the avatar
+
+
+class Meshes(Protocol):
+    """Meshes by number: vertices [V, 3], metres, and faces [F, 3]."""
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 @dataclass
@@ -39,13 +61,17 @@ class FrameRecord:
     """Points at which the field was evaluated; 0 for a frame that was there already."""
     components: int = 0
     """Connected surfaces; 0 for a frame that was there already."""
+    is_capped: bool = False
+    """Whether the surface reached the border of its box and was closed there."""
+    was_there: bool = False
+    """Whether the mesh was there already and was kept."""
     problem: str | None = None
     """Why there is no surface."""
 
 
 @dataclass
 class Animation:
-    """An avatar and a motion, and what to make of them."""
+    """An avatar and a motion, and what to make of them. It travels to worker processes as it is."""
 
     avatar: AvatarLike
     name: str
@@ -72,59 +98,160 @@ class Animation:
     """[T, J, 4, 4] canonical to posed, metres, where the poses do not say it all; None: those of the poses."""
     keep_share: float = 0.01
     """Connected surfaces with fewer faces than this share of the largest one's are dropped."""
+    screen: Screen | None = None
+    """How pictures are drawn; None draws none. Its contents are `avatar` and some of `CONTENTS`."""
+    truth: Meshes | None = None
+    """T meshes, if `truth` is on the screen."""
     frames: list[FrameRecord] = field(default_factory=list)
     """What has been done so far."""
 
-    def meshes(self, needed: bool = False) -> Iterator[tuple[FrameRecord, Mesh | None]]:
-        """Extract, write and yield the mesh of each frame, or None where there is no surface.
+    def pictures(self, processes: int = 1, threads: int = 1) -> Iterator[np.ndarray | None]:
+        """Extract and write the mesh of each frame, and yield its picture, or None without a screen.
+
+        Where there is no surface, the picture is that of the empty stage, so that the pace stays.
 
         Args:
-            needed: whether the mesh of a frame that is on disk already is read.
-        """
-        for index, number in enumerate(progress(self.numbers, desc=f"animate {self.name}", unit="frames")):
-            start = time.perf_counter()
-            file = self.folder / f"frame_{index:06d}.{self.suffix}" if self.suffix else None
-            frame = FrameRecord(frame=number, file=file.name if file else None)
-            mesh = None
-            if file and file.exists():
-                mesh = read_mesh(file) if needed else None
-                frame.vertices = len(mesh.vertices) if mesh else 0
-            else:
-                mesh = self._extract(index, frame)
-                if file and mesh is not None:
-                    write_mesh(file, mesh)
-            frame.extraction_s = round(time.perf_counter() - start, 4)
-            self.frames.append(frame)
-            yield frame, mesh
+            processes: how many make frames at the same time; 1 works in this one.
+            threads: threads of tensor work in each of several.
 
-    def pictures(self, stage: Stage, size: tuple[int, int]) -> Iterator[np.ndarray]:
-        """Yield a picture of each frame; the empty stage where there is no surface, so that the pace stays."""
-        for frame, mesh in self.meshes(needed=True):
-            start = time.perf_counter()
-            picture = render(mesh, stage.camera, size, floor_y=stage.floor_y)
-            frame.rendering_s = round(time.perf_counter() - start, 4)
-            yield picture
+        Raises:
+            UserError: a process ended without a word, as when the system kills it for want of memory.
+        """
+        count = len(self.numbers)
+        if processes == 1:
+            made = (self.make(index) for index in range(count))
+        else:
+            made = _made_elsewhere(replace(self, frames=[]), min(processes, count), threads)
+        with contextlib.closing(made):
+            shown = progress(zip(range(count), made, strict=True), total=count, desc=f"animate {self.name}", unit="frames")
+            for _, (frame, picture) in shown:
+                if frame.problem:
+                    log.warning("frame %d: %s", frame.frame, frame.problem)
+                if frame.is_capped:
+                    log.warning("frame %d: the surface reaches the border of its box and was closed there", frame.frame)
+                self.frames.append(frame)
+                yield picture
+
+    def make(self, index: int) -> tuple[FrameRecord, np.ndarray | None]:
+        """Make one frame: its record, and its picture if there is a screen. The mesh is on disk then, if it is written."""
+        start = time.perf_counter()
+        file = self.folder / f"frame_{index:06d}.{self.suffix}" if self.suffix else None
+        frame = FrameRecord(frame=self.numbers[index], file=file.name if file else None)
+        mesh = None
+        if file and file.exists():
+            frame.was_there = True
+            mesh = read_mesh(file) if self.screen else None
+            frame.vertices = len(mesh.vertices) if mesh else 0
+        else:
+            mesh = self._extract(index, frame)
+            if file and mesh is not None:
+                write_mesh(file, mesh)
+        frame.extraction_s = round(time.perf_counter() - start, 4)
+        if self.screen is None:
+            return frame, None
+        start = time.perf_counter()
+
+        def solid_of(content: str) -> Solid | None:
+            shown = mesh if content == "avatar" else self._beside(content, index, frame)
+            return Solid(shown) if shown is not None and len(shown.faces) else None
+
+        picture = self.screen.draw(index, solid_of)
+        frame.rendering_s = round(time.perf_counter() - start, 4)
+        return frame, picture
+
+    def _posed(self, index: int, surface: str, weights_from: Mesh | None = None) -> Mesh:
+        return posed_mesh(
+            self.avatar,
+            torch.from_numpy(self.poses[index]).float(),
+            torch.from_numpy(self.translation[index]).float(),
+            self.resolution,
+            surface=surface,
+            weights_from=weights_from,
+            keep_share=self.keep_share,
+            transforms=None if self.bone_transforms is None else torch.from_numpy(self.bone_transforms[index]),
+        )
 
     def _extract(self, index: int, frame: FrameRecord) -> Mesh | None:
         try:
-            mesh = posed_mesh(
-                self.avatar,
-                torch.from_numpy(self.poses[index]).float(),
-                torch.from_numpy(self.translation[index]).float(),
-                self.resolution,
-                surface=self.surface,
-                weights_from=self.weights_from if self.weight_colors else None,
-                keep_share=self.keep_share,
-                transforms=None if self.bone_transforms is None else torch.from_numpy(self.bone_transforms[index]),
-            )
+            mesh = self._posed(index, self.surface, self.weights_from if self.weight_colors else None)
         except (EmptySurface, FullSurface) as error:
             frame.problem, frame.file = str(error), None
-            log.warning("frame %d: %s", frame.frame, error)
             return None
         frame.vertices = len(mesh.vertices)
-        frame.points, frame.components = mesh.stats.points, mesh.stats.kept
-        if mesh.stats.capped:
-            log.warning("frame %d: the surface reaches the border of its box and was closed there", frame.frame)
-        if self.weight_colors and mesh.weights is not None:
-            mesh = replace(mesh, colors=weights_to_colors(mesh.weights))
-        return mesh
+        if mesh.stats is not None:
+            frame.points, frame.components, frame.is_capped = mesh.stats.points, mesh.stats.kept, mesh.stats.capped
+        return _colored(mesh) if self.weight_colors else mesh
+
+    def _beside(self, content: str, index: int, frame: FrameRecord) -> Mesh | None:
+        """Return what is shown beside the avatar, as one of `CONTENTS`; None if it has no surface."""
+        try:
+            if content == "truth":
+                assert self.truth is not None
+                vertices, faces = self.truth[index]
+                return Mesh(vertices, faces, colors=np.tile(np.uint8(_TRUTH_COLOR), (len(vertices), 1)))
+            if content == "canonical":
+                mesh = self._canonical(index)
+            else:
+                mesh = self._posed(index, "field" if content == "field" else "skinned")
+        except (EmptySurface, FullSurface) as error:
+            frame.problem = frame.problem or f"{CONTENTS[content]}: {error}"
+            return None
+        return _colored(mesh) if content == "weights" or self.weight_colors else mesh
+
+    def _canonical(self, index: int) -> Mesh:
+        """Return the canonical mesh in the shape of one pose, over x = z = 0, facing where the body mostly does."""
+        assert self.screen is not None
+        surface = self.avatar.skinned_surface(self.resolution, self.keep_share)
+        vertices = surface.canonical_vertices(torch.from_numpy(self.poses[index]).float())
+        stage = self.screen.stage
+        placed = place_canonical(vertices, surface.mesh, stage.heading_rad, stage.ground.height)
+        return replace(surface.mesh, vertices=placed, normals=None)
+
+
+def place_canonical(vertices: np.ndarray, mesh: Mesh, heading_rad: float, floor_y: float) -> np.ndarray:
+    """Return canonical vertices [V, 3] turned and moved so that `mesh` would stand over x = z = 0 on the floor."""
+    lower, upper = mesh.bounds
+    middle = (lower + upper) / 2
+    sin, cos = np.sin(heading_rad), np.cos(heading_rad)
+    turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    placed = (vertices - (middle[0], lower[1], middle[2])) @ turn.T + (0, floor_y, 0)
+    return placed.astype(np.float32)
+
+
+def _colored(mesh: Mesh) -> Mesh:
+    """Return a mesh in the colours of its weights, if it has any."""
+    return mesh if mesh.weights is None else replace(mesh, colors=weights_to_colors(mesh.weights))
+
+
+def _made_elsewhere(
+    animation: Animation, processes: int, threads: int
+) -> Iterator[tuple[FrameRecord, np.ndarray | None]]:
+    """Make the frames on several processes and yield them in order.
+
+    Of P processes each makes every P-th frame. One that is ahead waits until its frame is asked for, so no more than two
+    pictures a process are in memory.
+    """
+    workers: list[Worker] = []
+    try:
+        for first in range(processes):
+            with interrupts_held_back():
+                task = (animation, threads, range(first, len(animation.numbers), processes))
+                workers.append(Worker(_make_some, task, f"processes={max(1, processes // 2)}"))
+        for index in range(len(animation.numbers)):
+            has_item, item = workers[index % processes].receive()
+            assert has_item
+            yield item
+    finally:
+        for worker in workers:
+            worker.end()
+
+
+def _make_some(
+    animation: Animation, threads: int, numbers: Sequence[int]
+) -> Iterator[tuple[FrameRecord, np.ndarray | None]]:
+    """Make some frames in a worker process."""
+    # Whoever started it ends it so; leaving in order takes a half-written file along.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    torch.set_num_threads(threads)
+    for index in numbers:
+        yield animation.make(index)

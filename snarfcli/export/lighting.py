@@ -10,7 +10,7 @@ import numpy as np
 from snarfcli.export.camera import Camera
 from snarfcli.meshing.mesh import Mesh, vertex_normals
 
-__all__ = ["PATTERN", "LitScene", "Look", "dot"]
+__all__ = ["PATTERN", "LitScene", "Look", "Solid", "dot"]
 
 PATTERN = 3
 """Pixels, each way, whose rays complete each other; a blur of this width joins them."""
@@ -35,24 +35,20 @@ class Look:
     """Radiance of the light from behind, on the right."""
     key_radius: float = 0.22
     """Size of the key light over its distance: the larger, the softer its shadows."""
-    sky_rays: int = 12
+    sky_rays: int = 8
     """Occlusion rays towards the dome, a pixel."""
     key_rays: int = 4
     """Shadow rays towards the key light, a pixel."""
 
 
-class LitScene:
-    """A mesh in Embree, its lights, and what they reach."""
+class Solid:
+    """A mesh in Embree, from where any number of pictures of it are taken."""
 
-    def __init__(self, mesh: Mesh, camera: Camera, floor_y: float, look: Look) -> None:
+    def __init__(self, mesh: Mesh) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
         self.mesh = mesh
-        self.camera = camera
-        self.floor_y = floor_y
-        self.look = look
-        self.key, self.rim = _lights(camera)
         self.normals = vertex_normals(mesh.vertices, mesh.faces) if mesh.normals is None else mesh.normals
         # Embree wants coordinates near the origin to keep float32 precise.
         self.origin = ((mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2).astype(np.float32)
@@ -68,6 +64,17 @@ class LitScene:
         """Return what rays [N, 3] from one point meet first: `primID` [N] (-1 for nothing), `u` and `v` [N]."""
         origins = np.broadcast_to((eye - self.origin).astype(np.float32), directions.shape)
         return self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
+
+
+class LitScene:
+    """A solid, the lights of one camera, and what they reach."""
+
+    def __init__(self, solid: Solid, camera: Camera, floor_y: float, look: Look) -> None:
+        self.solid = solid
+        self.camera = camera
+        self.floor_y = floor_y
+        self.look = look
+        self.key, self.rim = _lights(camera)
 
     def gather(
         self, points: np.ndarray, normals: np.ndarray, phase: np.ndarray, *, floor: bool
@@ -89,7 +96,7 @@ class LitScene:
         lifted = np.concatenate([disc, np.sqrt(np.maximum(1 - (disc**2).sum(axis=2, keepdims=True), 0))], axis=2)
         rays = (lifted[phase] @ np.stack([tangent, bitangent, normals], axis=1)).reshape(-1, 3)
         begin = start.repeat(look.sky_rays, axis=0)
-        free = np.minimum(self.distances(begin, rays) / _REACH, 1).reshape(count, -1)
+        free = np.minimum(self.solid.distances(begin, rays) / _REACH, 1).reshape(count, -1)
         up = rays[:, 1].reshape(count, -1)
         share = np.float32(1 / look.sky_rays)
         # Each ray brings a share of the sky, of the floor or of what it meets: sum the shares, then weigh the colours.
@@ -107,7 +114,7 @@ class LitScene:
 
         across = np.concatenate(_frames(self.key[None]))
         rays = (self.key + look.key_radius * _spiral(look.key_rays) @ across).astype(np.float32)[phase].reshape(-1, 3)
-        clear = self.distances(start.repeat(look.key_rays, axis=0), rays) > 1e6
+        clear = self.solid.distances(start.repeat(look.key_rays, axis=0), rays) > 1e6
         return dome, clear.reshape(count, look.key_rays).mean(axis=1)
 
 

@@ -2,71 +2,82 @@
 
 DESIGN. Primary rays are cast only inside the mesh's box on the screen, `supersample` squared a pixel. Light comes from a sky
 dome and a large key light, both tested for occlusion with a few rays a pixel; neighbouring pixels turn the same
-directions differently and a small blur joins them, so that 12 rays look like a hundred. The floor is an analytic plane
-whose shadow is computed on a coarse grid around the mesh. 512 x 512 takes a quarter of a second of one core.
+directions differently and a small blur joins them, so that 12 rays look like a hundred. What does not change from picture
+to picture is kept: a `Solid` serves several cameras, a `Backdrop` all pictures of a camera that stands still. A body at
+512 x 512 takes a sixth of a second of one core (benchmarks/bm_video.py).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
+from scipy.ndimage import uniform_filter
 
 from snarfcli.export.camera import Camera
-from snarfcli.export.lighting import PATTERN, LitScene, Look, dot
+from snarfcli.export.floor import Backdrop, Ground
+from snarfcli.export.lighting import PATTERN, LitScene, Look, Solid, dot
 from snarfcli.meshing.mesh import Mesh
 
 __all__ = ["Look", "render"]
 
 _LOOK = Look()
-_FLOOR_CELLS = 128  # floor shadow grid, each way: 2 to 3 cm for a standing body
+_KNEE = 0.8  # linear colour from which highlights roll off instead of clipping
+_BRIGHTEST = 4.0  # beyond it nothing changes any more in 8 bits
 
 
 def render(
-    mesh: Mesh | None,
+    mesh: Mesh | Solid | None,
     camera: Camera,
     size: int | tuple[int, int] = 512,
     *,
     floor_y: float | None = None,
     supersample: int = 2,
     look: Look = _LOOK,
+    backdrop: Backdrop | None = None,
 ) -> np.ndarray:
     """Draw a mesh on a plain floor.
 
     Args:
-        mesh: its colours are used as albedo if it has any; None draws the empty stage.
+        mesh: its colours are used as albedo if it has any; None draws the empty stage. A `Solid` for several pictures.
         camera: where from.
         size: pixels, (width, height) or one number for both.
         floor_y: height of the floor, metres; the lowest vertex by default.
         supersample: rays along each side of a pixel.
         look: colours and lights.
+        backdrop: what was prepared for this camera, size and look, with a floor of its own.
 
     Returns:
         [height, width, 3] uint8, sRGB.
 
     Raises:
-        ValueError: size or supersample is not positive.
+        ValueError: size or supersample is not positive, or the backdrop is for another picture.
     """
     width, height = (size, size) if isinstance(size, int) else size
     if width < 1 or height < 1 or supersample < 1:
         raise ValueError(f"size: wanted positive numbers, got {width} x {height} pixels of {supersample} rays a side")
-    if mesh is not None and not len(mesh.faces):
-        mesh = None
-    if floor_y is None:
-        floor_y = float(mesh.vertices[:, 1].min()) if mesh is not None else 0.0
-    scene = None if mesh is None else LitScene(mesh, camera, floor_y, look)
-    picture = _floor_and_backdrop(scene, camera, width, height, floor_y, look).reshape(-1, 3)
+    if isinstance(mesh, Mesh):
+        mesh = Solid(mesh) if len(mesh.faces) else None
+    if backdrop is None:
+        if floor_y is None:
+            floor_y = float(mesh.mesh.vertices[:, 1].min()) if mesh is not None else 0.0
+        backdrop = Backdrop(camera, (width, height), Ground(floor_y), look)
+    elif (backdrop.camera, backdrop.size, backdrop.look) != (camera, (width, height), look) or floor_y is not None:
+        raise ValueError("backdrop: wanted one for this camera, size and look, which brings its own floor")
+    scene = None if mesh is None else LitScene(mesh, camera, backdrop.ground.height, look)
+    picture = backdrop.picture(scene)
     if scene is not None:
         pixel, color = _draw(scene, width, height, supersample)
         share = 1 / supersample**2
-        cover = np.bincount(pixel, minlength=len(picture)) * share
-        added = np.stack([np.bincount(pixel, color[:, i], minlength=len(picture)) for i in range(3)], axis=1) * share
-        picture = picture * (1 - cover[:, None]) + added
+        cover = np.bincount(pixel, minlength=len(picture))
+        drawn = np.flatnonzero(cover)
+        added = np.stack([np.bincount(pixel, color[:, i], minlength=len(picture))[drawn] for i in range(3)], axis=1)
+        picture[drawn] = picture[drawn] * (1 - share * cover[drawn, None]) + share * added
     return _to_srgb(picture).reshape(height, width, 3)
 
 
 def _draw(scene: LitScene, width: int, height: int, supersample: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixel [M] that each ray which hits belongs to and the colour [M, 3] it sees, linear."""
-    camera, mesh = scene.camera, scene.mesh
+    camera, solid = scene.camera, scene.solid
+    mesh = solid.mesh
     low, high = _screen_box(scene, width, height)
     columns = np.arange(low[0] * supersample, high[0] * supersample)
     rows = np.arange(low[1] * supersample, high[1] * supersample)
@@ -74,7 +85,7 @@ def _draw(scene: LitScene, width: int, height: int, supersample: int) -> tuple[n
     if not sample_x.size:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
     view = camera.rays((sample_x + 0.5) / supersample, (sample_y + 0.5) / supersample, width, height)
-    hits = scene.first_hits(np.asarray(camera.position), view)
+    hits = solid.first_hits(np.asarray(camera.position), view)
     seen = hits["primID"] >= 0
     sample_x, sample_y, view = sample_x[seen], sample_y[seen], view[seen]
     corner = mesh.faces[hits["primID"][seen]]
@@ -84,7 +95,7 @@ def _draw(scene: LitScene, width: int, height: int, supersample: int) -> tuple[n
     def blend(attribute: np.ndarray) -> np.ndarray:
         return np.einsum("nk,nkc->nc", share, attribute[corner])
 
-    points, normals = blend(mesh.vertices), blend(scene.normals)
+    points, normals = blend(mesh.vertices), blend(solid.normals)
     normals /= np.sqrt(np.maximum(dot(normals, normals), 1e-12))
     # Inner sides of open meshes, and smooth normals that look away at the silhouette.
     normals = np.where(dot(normals, view) > 0.25, -normals, normals)
@@ -128,63 +139,12 @@ def _shade(
 
 def _screen_box(scene: LitScene, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels (lower, upper) around the projected mesh; all of them if it reaches behind the camera."""
-    pixels = scene.camera.project(scene.mesh.vertices, width, height)
+    pixels = scene.camera.project(scene.solid.mesh.vertices, width, height)
     limit = np.array([width, height])
     if (pixels[:, 2] <= 1e-3).any():
         return np.zeros(2, dtype=int), limit
     low = np.floor(pixels[:, :2].min(axis=0) - 1).clip(0, limit).astype(int)
     return low, np.ceil(pixels[:, :2].max(axis=0) + 1).clip(low, limit).astype(int)
-
-
-def _floor_and_backdrop(
-    scene: LitScene | None, camera: Camera, width: int, height: int, floor_y: float, look: Look
-) -> np.ndarray:
-    """Return the empty stage [height, width, 3], linear, with the shadow of the scene on the floor."""
-    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5))
-    view = camera.rays(x, y, width, height)
-    backdrop = np.asarray(look.backdrop) * (1.02 - 0.10 * (y / height)[:, None])
-    above = camera.position[1] - floor_y
-    down = -view[:, 1]
-    meets = (down > 1e-4) & (above > 0)
-    distance = np.where(meets, above / np.where(meets, down, 1), 1e9)
-    ground = np.asarray(camera.position)[[0, 2]] + view[:, [0, 2]] * distance[:, None]
-    light = np.ones(len(ground), dtype=np.float32)
-    if scene is not None:
-        shadow, low, cell = _floor_shadow(scene)
-        spot = (ground - low) / cell - 0.5
-        light = map_coordinates(shadow, spot.T, order=1, mode="nearest")
-    # A pool of light that fades into the backdrop, so that no horizon shows.
-    reach = np.linalg.norm(np.subtract(camera.position, camera.target))
-    away = np.linalg.norm(ground - np.asarray(camera.target)[[0, 2]], axis=1) / reach
-    fade = np.clip((away - 0.12) / 0.75, 0, 1)
-    fade = np.where(meets, fade * fade * (3 - 2 * fade), 1)[:, None]
-    floor = np.asarray(look.floor) * light[:, None]
-    return (floor * (1 - fade) + backdrop * fade * (1 - (1 - light[:, None]) * (1 - fade))).reshape(height, width, 3)
-
-
-def _floor_shadow(scene: LitScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the light on the floor around the mesh: a grid [X, Z] of shares, its lower corner and cell size, metres."""
-    low, high = scene.mesh.bounds
-    tall = max(float(high[1]) - scene.floor_y, 0.05)
-    thrown = -scene.key[[0, 2]] / scene.key[1] * tall
-    corners = np.stack([low[[0, 2]], high[[0, 2]], low[[0, 2]] + thrown, high[[0, 2]] + thrown])
-    margin = 0.45 * tall
-    lower, upper = corners.min(axis=0) - margin, corners.max(axis=0) + margin
-    cell = (upper - lower) / _FLOOR_CELLS
-    index = np.stack(np.meshgrid(np.arange(_FLOOR_CELLS), np.arange(_FLOOR_CELLS), indexing="ij"), axis=-1).reshape(-1, 2)
-    spots = lower + (index + 0.5) * cell
-    points = np.stack([spots[:, 0], np.full(len(spots), scene.floor_y), spots[:, 1]], axis=1)
-    normals = np.broadcast_to((0.0, 1.0, 0.0), points.shape)
-    phase = (index[:, 0] % PATTERN) * PATTERN + index[:, 1] % PATTERN
-    dome, key = scene.gather(points, normals, phase, floor=False)
-    grid = np.stack([dome.mean(axis=1), key]).reshape(2, _FLOOR_CELLS, _FLOOR_CELLS)
-    grid = np.stack([gaussian_filter(uniform_filter(g, PATTERN, mode="nearest"), 0.9) for g in grid])
-    dome = np.minimum(grid[0] / np.percentile(grid[0], 90), 1)  # the farthest tenth counts as open
-    light = 0.58 * dome**1.6 + 0.42 * grid[1]
-    # The border of the grid must be unshaded, or its edge would show on the floor.
-    edge = np.minimum(np.arange(_FLOOR_CELLS), np.arange(_FLOOR_CELLS)[::-1]) / (0.2 * _FLOOR_CELLS)
-    inner = np.minimum(np.minimum.outer(edge, edge), 1)
-    return 1 - (1 - light) * inner * inner * (3 - 2 * inner), lower, cell
 
 
 def from_srgb(color: np.ndarray) -> np.ndarray:
@@ -194,9 +154,17 @@ def from_srgb(color: np.ndarray) -> np.ndarray:
 
 
 def _to_srgb(color: np.ndarray) -> np.ndarray:
-    """Return sRGB bytes of linear colour; highlights above 0.8 roll off instead of clipping."""
-    knee = 0.8
-    over = np.maximum(color - knee, 0)
-    color = np.where(color > knee, knee + (1 - knee) * (1 - np.exp(-over / (1 - knee))), np.maximum(color, 0))
+    """Return sRGB bytes of linear colour; highlights roll off instead of clipping."""
+    return _SRGB[(color.clip(0, _BRIGHTEST) * ((len(_SRGB) - 1) / _BRIGHTEST) + 0.5).astype(np.intp)]
+
+
+def _srgb_table(count: int = 2**16) -> np.ndarray:
+    """Return the sRGB bytes [count] of linear colours from 0 to the brightest; so many tell all bytes but the darkest apart."""
+    color = np.linspace(0, _BRIGHTEST, count)
+    over = np.maximum(color - _KNEE, 0)
+    color = np.where(color > _KNEE, _KNEE + (1 - _KNEE) * (1 - np.exp(-over / (1 - _KNEE))), color)
     srgb = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
-    return np.rint(255 * srgb.clip(0, 1)).astype(np.uint8)
+    return np.rint(255 * srgb).astype(np.uint8)
+
+
+_SRGB = _srgb_table()

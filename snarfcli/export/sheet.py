@@ -9,7 +9,7 @@ import numpy as np
 
 from snarfcli.files import atomic_path
 
-__all__ = ["contact_sheet", "write_png"]
+__all__ = ["contact_sheet", "text_strip", "write_png"]
 
 _INK = (52, 56, 62)
 _PAPER = (247, 248, 249)
@@ -84,6 +84,23 @@ def contact_sheet(
             if captions:
                 write(captions[index][column], x, y + height, small, width)
     return np.asarray(sheet)
+
+
+def text_strip(labels: Sequence[str], part: int) -> np.ndarray:
+    """Return a strip of paper, [H, W, 3] uint8, with the labels centred on parts of `part` pixels, one pixel between them.
+
+    Labels that are too wide are shortened; the height depends on `part` alone.
+    """
+    from PIL import Image, ImageDraw
+
+    font = _font(min(max(10, part // 24), 40))
+    line = _line(font)
+    strip = Image.new("RGB", (len(labels) * (part + 1) - 1, line), _PAPER)
+    draw = ImageDraw.Draw(strip)
+    for index, label in enumerate(labels):
+        middle = index * (part + 1) + part / 2
+        draw.text((middle, line / 2), _shortened(label, font, part - 2), fill=_INK, font=font, anchor="mm")
+    return np.asarray(strip)
 
 
 def write_png(path: str | Path, picture: np.ndarray) -> None:

@@ -77,7 +77,12 @@ def config(tmp_path: Path, pose_file: Path, toy: ToyAvatar) -> AnimateConfig:
         weight_colors=False,
         video=True,
         video_size="64",
+        views=["front"],
         azimuth_deg=0.0,
+        camera="still",
+        turntable="false",
+        beside=[],
+        processes="1",
         elevation_deg=5.0,
         output=None,
         overwrite=False,
@@ -105,7 +110,7 @@ def test_meshes_video_and_record(config, toy):
     assert run(replace(config, video_size="80x64")) == 0
     folder = folder_of(config)
     names = [f"frame_{index:06d}.ply" for index in range(6)]
-    assert sorted(path.name for path in folder.iterdir()) == ["animation.json", *names, "video.mp4"]
+    assert sorted(path.name for path in folder.iterdir()) == ["animation.json", *names, "poster.png", "video.mp4"]
     solids = [trimesh.load(folder / name, process=False) for name in names]
     for solid in solids:
         assert solid.is_watertight and solid.volume == pytest.approx(VOLUME, rel=0.15)  # bends lose volume

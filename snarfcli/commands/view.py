@@ -1,0 +1,190 @@
+"""`snarf view`: an avatar in the browser, to pose it, to play motions and to look at it closely."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING
+
+from snarfcli.checks import check_choice, check_number
+from snarfcli.commands.choices import AvatarChoice, MotionChoice, check_motion_choice, choose_motion, load_chosen_avatar
+from snarfcli.datasets.store import SampleStore
+from snarfcli.errors import UserError
+from snarfcli.models.avatar import Avatar
+from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
+from snarfcli.motions.layouts import SMPL, layout_of
+from snarfcli.viewer.picture import SURFACE_NAMES, Look
+from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback, require_viser
+
+__all__ = ["ViewConfig", "run", "start"]
+
+log = logging.getLogger(__name__)
+
+_RESOLUTIONS = (16, 1024)
+
+
+@dataclass
+class ViewConfig(AvatarChoice, MotionChoice):
+    """Settings of `snarf view`."""
+
+    pose: list[str] = MISSING
+    """Motions to choose from, the first is played: .npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, or folders of frames."""
+    motion: str | None = MISSING
+    """Built-in motion, or sequence of the samples, that is played first where there is no pose file; null for none."""
+    surface: str = MISSING
+    """At first: skinned (the canonical mesh moved by its skin, at once) or field (the union, made in the background)."""
+    resolution: int = MISSING
+    """At first: voxels along the longest side, 16 to 1024."""
+    weight_colors: bool = MISSING
+    """Whether vertices are coloured by their skinning weights at first."""
+    host: str = MISSING
+    """Address to listen at: 127.0.0.1 for this machine only, 0.0.0.0 for whoever reaches it."""
+    port: str = MISSING
+    """Port to listen at; auto (or 0) for any free one."""
+    open: bool = MISSING
+    """Whether to open the page in the browser, where there is a display."""
+
+
+def run(config: ViewConfig) -> int:
+    """Serve the page until Ctrl-C.
+
+    Returns:
+        0 if the server ends by itself; Ctrl-C raises KeyboardInterrupt, which ends the command with 130.
+
+    Raises:
+        UserError: there is no viser, no avatar or no such motion, or the port is in use.
+    """
+    server = start(config)
+    try:
+        server.wait()
+    finally:
+        server.stop()
+    return 0
+
+
+def start(config: ViewConfig) -> ViewServer:
+    """Start serving the page, tell where, open the browser where that makes sense, and return at once.
+
+    Raises:
+        UserError: as `run`.
+    """
+    require_viser()
+    port = _check(config)
+    check_port(config.host, port)
+    avatar, path = load_chosen_avatar(config)
+    if not avatar.has_skinning_weights and (config.weight_colors or config.surface == "skinned"):
+        log.info("model %s has no skinning weights: only its field is shown", avatar.config.model.name)
+    shelf = _Shelf(config, avatar)
+    look = Look(
+        surface=config.surface,
+        skinned_resolution=config.resolution,
+        field_resolution=config.resolution,
+        weight_colors=config.weight_colors,
+    )
+    server = ViewServer(
+        avatar,
+        look,
+        host=config.host,
+        port=port,
+        motions=shelf.names,
+        load_motion=shelf.load,
+        facts=_facts(config, avatar, path),
+        first_motion=shelf.first,
+    )
+    _announce(config, avatar, path, server.port)
+    return server
+
+
+def _check(config: ViewConfig) -> int:
+    """Refuse settings that cannot be used, before any work starts; return the port, 0 for any."""
+    check_motion_choice(config)
+    check_choice("surface", config.surface, SURFACE_NAMES)
+    check_number("resolution", config.resolution, *_RESOLUTIONS)
+    text = config.port.strip()
+    if text == "auto":
+        return 0
+    if not (text.isascii() and text.isdecimal() and int(text) < 65536):
+        raise UserError(f"port must be a number from 1 to 65535, or auto for any free one, got '{config.port}'")
+    return int(text)
+
+
+class _Shelf:
+    """The motions that can be chosen on the page.
+
+    Raises:
+        UserError: a pose file or the motion to play first cannot be used; better now than on the page.
+    """
+
+    def __init__(self, config: ViewConfig, avatar: Avatar) -> None:
+        self._config = config
+        self._skeleton = avatar.skeleton
+        self._loaded: dict[str, tuple[Any, Any]] = {}
+        for path in config.pose:
+            chosen = choose_motion(config, config, self._skeleton, path, None)
+            self._loaded[f"file: {Path(path).name}"] = chosen.motion, chosen.bone_transforms
+        self.names: list[str] = [*self._loaded, *_own_motions(config, avatar)]
+        first = next(iter(self._loaded), config.motion)
+        self.first: tuple[str, Any, Any] | None = None if first is None else (first, *self.load(first))
+        """Name, motion and bone transforms of what is played first; None for nothing."""
+        if first is not None and first not in self.names:
+            self.names.insert(0, first)
+
+    def load(self, name: str) -> tuple[Any, Any]:
+        """Return the motion of a name, and its bone transforms where joints stretch; raises UserError."""
+        if name not in self._loaded:
+            chosen = choose_motion(self._config, self._config, self._skeleton, None, name)
+            self._loaded[name] = chosen.motion, chosen.bone_transforms
+        return self._loaded[name]
+
+
+def _own_motions(config: ViewConfig, avatar: Avatar) -> list[str]:
+    """Return the motions that need no file: built-in ones, or the sequences of a skeleton's own samples."""
+    if layout_of(avatar.skeleton) == SMPL:
+        return [*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES]
+    if config.data.name == "builtin":
+        return []
+    try:
+        store = SampleStore.open(config.data_root, config.data.name, config.subject)
+    except UserError:
+        return []  # the avatar alone can be posed as well
+    if (store.skeleton.names, store.skeleton.parents) != (avatar.skeleton.names, avatar.skeleton.parents):
+        return []
+    return [sequence.name for sequence in store.all_sequences]
+
+
+def _facts(config: ViewConfig, avatar: Avatar, path: Path) -> dict[str, str]:
+    """Return what the page tells about the avatar."""
+    settings = avatar.config
+    facts = {
+        "subject": str(avatar.facts.get("subject", config.subject)),
+        "data": str(avatar.facts.get("data", config.data.name)),
+        "model": settings.model.name,
+        "condition": settings.condition.name,
+        "joints": str(avatar.skeleton.num_joints),
+        "device": str(avatar.device),
+        "file": path.name if config.ckpt else f"{path.parent.name}/{path.name}",
+    }
+    if "steps" in avatar.facts:
+        facts["training steps"] = f"{avatar.facts['steps']}"
+    return facts
+
+
+def _announce(config: ViewConfig, avatar: Avatar, path: Path, port: int) -> None:
+    """Say where the page is, and open it where whoever typed the command would see it."""
+    name = f"[{config.host}]" if ":" in config.host else config.host
+    name = "127.0.0.1" if config.host in ("0.0.0.0", "::") else name
+    address = f"http://{name}:{port}"
+    log.info("avatar: %s, on %s", path, avatar.device)
+    log.info("page: %s (Ctrl-C ends it)", address)
+    if not is_loopback(config.host):
+        log.warning("host=%s: anybody who reaches this machine over the network can see and change the page", config.host)
+    if config.open and can_open_browser():
+        webbrowser.open(address)
+    elif is_loopback(config.host) and (os.environ.get("SSH_CONNECTION") or not can_open_browser()):
+        log.info("from another machine: ssh -L %d:127.0.0.1:%d %s, then open the page there", port, port, socket.gethostname())

@@ -1,0 +1,1 @@
+"""The avatar in the browser: what is shown is decided here, viser only shows it."""

@@ -1,0 +1,118 @@
+"""Joints as a person poses them: readable names by limb, three angles in degrees each, left and right mirrored."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from snarfcli.bodies import Skeleton
+from snarfcli.motions.joint_names import find_body_parts
+
+__all__ = [
+    "ANGLE_LIMITS_DEG",
+    "angles_of",
+    "global_turns",
+    "joint_labels",
+    "mirrored_joint",
+    "pose_file",
+    "posed_joints",
+    "vector_from_turn",
+    "vector_of",
+]
+
+# Order of turns: x first, then y, then z, each about the axes of the parent (Blender's "XYZ Euler"). With the middle angle
+# within a quarter turn every rotation has one set of angles, so these limits leave none out.
+_ORDER = "xyz"
+ANGLE_LIMITS_DEG: tuple[float, float, float] = (180.0, 90.0, 180.0)
+"""Largest angle about x, y and z, degrees."""
+
+_SIDES = {"l": "left", "r": "right"}
+_LIMBS = (
+    ("arm", ("collar", "shoulder", "elbow", "wrist", "hand")),
+    ("hand", ("index", "middle", "pinky", "ring", "thumb")),
+    ("leg", ("hip", "knee", "ankle", "foot")),
+)
+_HEAD = ("neck", "head", "jaw", "l_eye", "r_eye")
+
+
+def angles_of(vector: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return a rotation vector [3], radians, as angles in degrees about x, y and z."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # at a quarter turn about y one of many triples is as good as another
+        x, y, z = Rotation.from_rotvec(vector).as_euler(_ORDER, degrees=True)
+    return float(x), float(y), float(z)
+
+
+def vector_of(angles: tuple[float, float, float] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles in degrees about x, y and z as a rotation vector [3], radians."""
+    return Rotation.from_euler(_ORDER, angles, degrees=True).as_rotvec()
+
+
+def joint_labels(skeleton: Skeleton) -> dict[str, int]:
+    """Return a label for each joint but the root, limb by limb: `left arm: elbow`, `trunk: spine2`, `Tail_03`."""
+    parts = find_body_parts(skeleton.names, skeleton.parents)
+    parts_of = {joint: part for part, joint in parts.joints.items()}
+    limbs: dict[str, list[int]] = {}
+    for joint in range(1, skeleton.num_joints):
+        limbs.setdefault(_limb_of(joint, parts_of.get(joint), parts.spine), []).append(joint)
+    order = ["trunk", "head", *(f"{side} {limb}" for limb in ("arm", "hand", "leg") for side in _SIDES.values())]
+    labels: dict[str, int] = {}
+    for limb in sorted(limbs, key=lambda name: order.index(name) if name in order else len(order)):
+        for joint in limbs[limb]:
+            name = skeleton.names[joint]
+            label = f"{limb}: {_without_side(name)}" if limb else name
+            labels[label if label not in labels else f"{label} ({joint})"] = joint
+    return labels
+
+
+def _limb_of(joint: int, part: str | None, spine: tuple[int, ...]) -> str:
+    """Return the limb that a joint belongs to; empty for one that is no known part of a human body."""
+    if joint in spine or part == "pelvis":
+        return "trunk"
+    if part is None:
+        return ""
+    if part in _HEAD:
+        return "head"
+    side, _, name = part.partition("_")
+    plain = re.sub(r"\d+$", "", name)
+    return next((f"{_SIDES[side]} {limb}" for limb, names in _LIMBS if plain in names and side in _SIDES), "")
+
+
+def _without_side(name: str) -> str:
+    """Return a joint's name without the side, which the limb's name has already, where it stands in SMPL's way."""
+    return name[2:] if name[:2] in ("l_", "r_") else name
+
+
+def mirrored_joint(skeleton: Skeleton, joint: int, vector: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
+    """Return the joint on the other side, and the rotation vector [3] that mirrors one of `joint` in the plane x = 0."""
+    return skeleton.left_right[joint], vector * (1.0, -1.0, -1.0)
+
+
+def posed_joints(skeleton: Skeleton, transforms: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the joints [J, 3] under bone transforms [J, 4, 4], canonical to posed, metres."""
+    joints_c = skeleton.canonical_joints.cpu().numpy().astype(np.float32)
+    return np.einsum("jrc,jc->jr", transforms[:, :3, :3], joints_c) + transforms[:, :3, 3]
+
+
+def pose_file(pose: NDArray[np.float64], translation: NDArray[np.float64]) -> bytes:
+    """Return one pose [J, 3] and its translation [3] as an .npz file that `--pose` reads, y up."""
+    buffer = io.BytesIO()
+    np.savez(buffer, poses=pose.reshape(1, -1), trans=translation.reshape(1, 3), mocap_framerate=30.0)
+    return buffer.getvalue()
+
+
+def global_turns(skeleton: Skeleton, transforms: NDArray[np.float32]) -> Rotation:
+    """Return the rotations of the J joints from the rest pose under bone transforms [J, 4, 4], canonical to posed."""
+    canonical_from_rest = skeleton.posed_from_rest(skeleton.canonical_pose[None])[0, :, :3, :3].cpu().numpy()
+    return Rotation.from_matrix(transforms[:, :3, :3].astype(np.float64) @ canonical_from_rest)
+
+
+def vector_from_turn(skeleton: Skeleton, transforms: NDArray[np.float32], joint: int, turn: Rotation) -> NDArray[np.float64]:
+    """Return the rotation vector [3] relative to its parent that gives a joint the rotation `turn` from the rest pose."""
+    parent = skeleton.parents[joint]
+    return (turn if parent < 0 else global_turns(skeleton, transforms)[parent].inv() * turn).as_rotvec()

@@ -1,0 +1,77 @@
+"""Playing a motion: which frame is due at which time."""
+
+from __future__ import annotations
+
+import math
+
+__all__ = ["Player"]
+
+
+class Player:
+    """A position in a motion that runs with a clock, or stands.
+
+    Time is whatever the caller's clock says, seconds; the player asks no clock itself.
+    """
+
+    def __init__(self) -> None:
+        self.num_frames = 0
+        self.frame_rate = 30.0
+        self.speed = 1.0
+        self.is_looping = True
+        self.is_playing = False
+        self._position = 0.0  # in frames, at the time `_since`
+        self._since = 0.0
+
+    def load(self, num_frames: int, frame_rate: float) -> None:
+        """Take another motion and stand at its first frame; one without frames is no motion."""
+        self.num_frames, self.frame_rate = num_frames, frame_rate
+        self.is_playing = False
+        self._position = 0.0
+
+    def frame(self, now: float) -> int:
+        """Return the number of the frame that is due; stop at the last one unless looping."""
+        position = self._at(now)
+        if self.is_playing and not self.is_looping and position >= self.num_frames - 1:
+            self._position, self.is_playing = float(max(self.num_frames - 1, 0)), False
+            position = self._position
+        return int(position + 1e-9)
+
+    def play(self, now: float) -> None:
+        """Run from the present frame; from the first one if this is the end."""
+        if self.num_frames == 0 or self.is_playing:
+            return
+        if not self.is_looping and self._position >= self.num_frames - 1:
+            self._position = 0.0
+        self._since, self.is_playing = now, True
+
+    def pause(self, now: float) -> None:
+        """Stand at the present frame."""
+        self._position = float(self.frame(now))
+        self.is_playing = False
+
+    def seek(self, frame: int, now: float) -> None:
+        """Go to a frame; what ran goes on from there."""
+        self._position, self._since = float(min(max(frame, 0), max(self.num_frames - 1, 0))), now
+
+    def change_speed(self, speed: float, now: float) -> None:
+        """Run at so many times the motion's own pace from now on."""
+        self._position, self._since, self.speed = self._at(now), now, speed
+
+    def change_looping(self, is_looping: bool, now: float) -> None:
+        """Start again after the last frame, or stand there."""
+        self._position, self._since, self.is_looping = self._at(now), now, is_looping
+
+    def seconds_to_next(self, now: float) -> float | None:
+        """Return how long the present frame still is due; None while the player stands."""
+        if not self.is_playing:
+            return None
+        position = self._at(now)
+        rate = self.frame_rate * self.speed
+        return max((math.floor(position + 1e-9) + 1 - position) / rate, 0.0)
+
+    def _at(self, now: float) -> float:
+        """Return the position in frames, within the motion."""
+        if not self.is_playing or self.num_frames == 0:
+            return self._position
+        position = self._position + (now - self._since) * self.frame_rate * self.speed
+        return position % self.num_frames if self.is_looping else min(position, float(self.num_frames - 1))

@@ -1,0 +1,189 @@
+"""What stands on viser's stage: the avatar, its canonical shape, the skeleton, the floor, and the camera before them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from snarfcli.viewer.body import Posed
+from snarfcli.viewer.joints import global_turns, posed_joints, vector_from_turn
+from snarfcli.viewer.picture import Picture
+from snarfcli.viewer.surfaces import ShownSurface
+from snarfcli.viewer.viewing import Viewing
+
+__all__ = ["BODY_COLOR", "Scene"]
+
+BODY_COLOR = (205, 184, 168)
+"""Of the body, sRGB: clay, on which light and shade are seen well."""
+
+_BONE, _JOINT, _CHOSEN = (70, 80, 95), (255, 214, 102), (235, 94, 40)  # sRGB
+_SEE_THROUGH = 0.45  # opacity of a body whose skeleton is to be seen inside of it
+_FIELD_OF_VIEW_RAD = 0.6
+_ROOM = 0.68  # half the height of the picture over the size of the body
+
+
+class Scene:
+    """The stage that all who look see.
+
+    Args:
+        server: viser's.
+        viewing: what is shown.
+        choose_joint: called with the number of a joint that somebody clicked.
+        clock: seconds.
+    """
+
+    def __init__(
+        self, server: Any, viewing: Viewing, choose_joint: Callable[[int], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._server = server
+        self._viewing = viewing
+        self._skeleton = viewing.body.skeleton
+        self._choose_joint = choose_joint
+        self._clock = clock
+        self.body_color = BODY_COLOR
+        self.is_wireframe = False
+        self.shows_handle = False
+        self.chosen_joint = 0
+        self._shown: tuple | None = None
+        self._is_turning = False
+        joints = posed_joints(self._skeleton, viewing.posed.transforms)
+        self.size = float(max(np.ptp(joints, axis=0).max(), 0.1))
+        self._aside = float(np.ptp(joints[:, 0]) * 0.62 + 0.45 * self.size)
+        server.scene.set_up_direction("+y")
+        server.scene.configure_environment_map("studio", environment_intensity=0.2)
+        self._floor = server.scene.add_grid(
+            "/floor", plane="xz", infinite_grid=True, cell_size=self._square() / 4, section_size=self._square(),
+            cell_color=(222, 226, 230), section_color=(176, 183, 191), fade_distance=8 * self.size, fade_from="origin",
+            shadow_opacity=0.25,
+        )  # fmt: skip
+        self._body = ShownSurface(server, "/avatar")
+        self._canonical = ShownSurface(server, "/canonical")
+        self._label = server.scene.add_label("/canonical_label", "canonical shape", visible=False)
+        self._bones: Any = None
+        self._joints: Any = None
+        self._handle: Any = None
+        camera = server.initial_camera
+        camera.up, camera.fov = np.array([0.0, 1.0, 0.0]), _FIELD_OF_VIEW_RAD
+        camera.position, camera.look_at = self._camera(False)
+
+    def frame_body(self, camera: Any) -> None:
+        """Put a camera so that it sees the body, and the canonical shape beside it."""
+        position, look_at = self._camera(self._viewing.look.shows_canonical)
+        camera.up_direction, camera.position, camera.look_at = (0.0, 1.0, 0.0), position, look_at
+
+    def show(self, picture: Picture) -> None:
+        """Bring the stage up to date."""
+        look = self._viewing.look
+        with self._server.atomic():
+            self._floor.position = (0.0, self._viewing.floor_y, 0.0)
+            mesh = picture.mesh
+            made = () if mesh is None else (mesh.posed.number, mesh.surface, mesh.seconds, id(mesh.faces))
+            key = (*made, look, self.body_color, self.is_wireframe)
+            if key != self._shown:
+                self._shown = key
+                self._show_surfaces(picture)
+        self.advance()
+        self._show_skeleton(self._body.seen or picture.shown)
+
+    def advance(self) -> float | None:
+        """Go on with what takes its time; return for how many seconds there is nothing to do, None for for ever."""
+        now = self._clock()
+        times = [due for due in (self._body.advance(now), self._canonical.advance(now)) if due is not None]
+        return max(min(times) - now, 0.0) if times else None
+
+    # ---------------------------------------------------------------- parts
+    def _show_surfaces(self, picture: Picture) -> None:
+        look = self._viewing.look
+        opacity = _SEE_THROUGH if look.shows_skeleton else 1.0
+        mesh = picture.mesh
+        if mesh is None:
+            self._body.hide()
+        else:
+            self._body.show(
+                mesh.vertices, mesh.faces, mesh.weights, self.body_color, opacity, self.is_wireframe, goes_with=mesh.posed
+            )
+        mesh_c = picture.canonical
+        if mesh_c is None:
+            self._canonical.hide()
+        else:
+            weights = mesh_c.weights if look.weight_colors else None
+            self._canonical.show(mesh_c.vertices, mesh_c.faces, weights, self.body_color, 1.0, self.is_wireframe)
+            low = float(mesh_c.vertices[:, 1].min())
+            self._canonical.place((-self._aside, self._viewing.floor_y - low, 0.0))
+            top = self._viewing.floor_y + float(np.ptp(mesh_c.vertices[:, 1])) + 0.06 * self.size
+            self._label.position = (-self._aside, top, 0.0)
+        self._label.visible = mesh_c is not None
+
+    def _show_skeleton(self, shown: Posed) -> None:
+        shows = self._viewing.look.shows_skeleton
+        if not shows and self._joints is None:
+            return
+        joints = posed_joints(self._skeleton, shown.transforms)
+        if self._joints is None:
+            self._make_skeleton(joints)
+        self._joints.visible = shows
+        if self._bones is not None:
+            self._bones.visible = shows
+        self._handle.visible = shows and self.shows_handle
+        if not shows:
+            return
+        self._joints.batched_positions = joints
+        colors = np.full((len(joints), 3), _JOINT, dtype=np.uint8)
+        colors[self.chosen_joint] = _CHOSEN
+        self._joints.batched_colors = colors
+        if self._bones is not None:
+            self._bones.points = joints[np.array(self._skeleton.bones)]
+        if not self._is_turning:
+            self._handle.position = joints[self.chosen_joint]
+            turn = global_turns(self._skeleton, shown.transforms)[self.chosen_joint]
+            self._handle.wxyz = turn.as_quat()[[3, 0, 1, 2]]
+
+    def _make_skeleton(self, joints: np.ndarray) -> None:
+        import trimesh
+
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.011 * self.size)
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(joints), 1))
+        self._joints = self._server.scene.add_batched_meshes_simple(
+            "/skeleton/joints", ball.vertices, ball.faces, turns, joints, lod="off", cast_shadow=False,
+            batched_colors=np.full((len(joints), 3), _JOINT, dtype=np.uint8), receive_shadow=False,
+        )  # fmt: skip
+        self._joints.on_click(lambda event: self._choose_joint(int(event.instance_index)))
+        if self._skeleton.bones:
+            ends = joints[np.array(self._skeleton.bones)]
+            self._bones = self._server.scene.add_line_segments("/skeleton/bones", ends, _BONE, thickness=0.007 * self.size)
+        self._handle = self._server.scene.add_transform_controls(
+            "/handle", scale=0.13 * self.size, disable_axes=True, disable_sliders=True, depth_test=False, visible=False
+        )
+        self._handle.on_drag_start(lambda event: self._turning(True))
+        self._handle.on_drag_end(lambda event: self._turning(False))
+        self._handle.on_update(lambda event: self._turn_chosen())
+
+    def _turning(self, is_turning: bool) -> None:
+        self._is_turning = is_turning
+
+    def _turn_chosen(self) -> None:
+        """Turn the chosen joint as somebody turned the handle."""
+        turn = Rotation.from_quat(np.asarray(self._handle.wxyz)[[1, 2, 3, 0]])
+        vector = vector_from_turn(self._skeleton, self._viewing.posed.transforms, self.chosen_joint, turn)
+        self._viewing.turn_joint(self.chosen_joint, vector)
+
+    def _square(self) -> float:
+        """Return the width of a square of the floor: a metre for people, a power of ten that suits other sizes."""
+        return float(10.0 ** np.floor(np.log10(self.size)))
+
+    def _camera(self, shows_canonical: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return where a camera stands and looks at, metres: in front of the body, somewhat to its left."""
+        joints = posed_joints(self._skeleton, self._viewing.posed.transforms)
+        floor_y, half = self._viewing.floor_y, self.size / 2
+        middle = np.array([joints[:, 0].mean(), floor_y + 1.05 * half, joints[:, 2].mean()])
+        low, high = middle - half, middle + half
+        if shows_canonical:
+            low[0] -= self._aside
+        look_at = (low + high) / 2 + (0.10 * self.size, 0.0, 0.0)  # the panel covers the right side
+        distance = _ROOM * max(high[0] - low[0], self.size) / np.tan(_FIELD_OF_VIEW_RAD / 2)
+        ahead = np.array([0.42, 0.22, 1.0])
+        return look_at + distance * ahead / np.linalg.norm(ahead), look_at

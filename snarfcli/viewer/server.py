@@ -1,0 +1,206 @@
+"""The page's server: where it listens, and the thread that keeps the page up to date."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import os
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from snarfcli.errors import UserError
+from snarfcli.viewer.body import Body
+from snarfcli.viewer.controls import Controls
+from snarfcli.viewer.picture import Look
+from snarfcli.viewer.scene import Scene
+from snarfcli.viewer.viewing import Viewing
+
+__all__ = ["ViewServer", "can_open_browser", "check_port", "is_loopback", "require_viser"]
+
+log = logging.getLogger(__name__)
+
+_TRIED_PORTS = 100
+_SHORTEST_S = 1 / 60  # between two pictures
+
+
+def require_viser() -> None:
+    """Refuse to go on without viser.
+
+    Raises:
+        UserError: it is not installed; says how to.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise UserError(f"the viewer needs viser ({error}); pip install 'snarf[view]'") from None
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches an address."""
+    import ipaddress
+
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def check_port(host: str, port: int) -> None:
+    """Make sure that a port can be listened at; 0 stands for any.
+
+    Raises:
+        UserError: it is in use, or the host is none of this machine's; names the next free port.
+    """
+    reason = _refusal(host, port)
+    if reason is None:
+        return
+    if isinstance(reason, PermissionError):
+        raise UserError(f"port {port} is reserved for the administrator; give --port with a number above 1023")
+    if port and not _is_address_fault(host):
+        free = next((number for number in range(port + 1, min(port + _TRIED_PORTS, 65536)) if not _refusal(host, number)), 0)
+        raise UserError(f"port {port} is in use; port {free} is free: give --port {free}" if free else
+                        f"port {port} is in use; give --port auto for any free one")  # fmt: skip
+    raise UserError(f"host {host} is no address of this machine ({reason}); leave it out, or give host=0.0.0.0 for all")
+
+
+def _refusal(host: str, port: int) -> OSError | None:
+    """Return why nothing can listen there, None if something can."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        with socket.socket(family, kind) as listener:
+            if os.name == "posix":  # a port whose last user has just gone is free
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen(1)
+    except OSError as error:
+        return error
+    return None
+
+
+def _is_address_fault(host: str) -> bool:
+    return _refusal(host, 0) is not None
+
+
+def can_open_browser(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
+    """Return whether a browser opened here would be seen by whoever typed the command: not over SSH, nor without a display."""
+    if environment.get("SSH_CONNECTION") or environment.get("SSH_TTY"):
+        return False
+    return platform in ("win32", "darwin") or bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
+
+
+class ViewServer:
+    """An avatar on a page; listens and draws from the moment it is made until `stop`.
+
+    Args:
+        avatar: who is shown.
+        look: how at first.
+        host: address to listen at.
+        port: its port; 0 takes any free one.
+        motions: names of the motions that can be played.
+        load_motion: returns the motion of a name and its bone transforms; raises UserError.
+        facts: what is told about the avatar.
+        first_motion: name, motion and bone transforms of what is played at first; None for nothing.
+
+    Raises:
+        UserError: the port is in use, or viser is not installed.
+    """
+
+    def __init__(
+        self,
+        avatar: Any,
+        look: Look,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        motions: Sequence[str] = (),
+        load_motion: Callable[[str], tuple[Any, Any]] | None = None,
+        facts: Mapping[str, str] | None = None,
+        first_motion: tuple[str, Any, Any] | None = None,
+    ) -> None:
+        require_viser()
+        check_port(host, port)
+        import viser
+
+        self._woken = threading.Event()
+        self._is_stopped = False
+        self.viewing = Viewing(Body(avatar), look, self._woken.set)
+        with _silence():
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.port: int = self.server.get_port()
+        if port not in (0, self.port):  # somebody else was faster, and viser went on to the next
+            self._stop_server()
+            raise UserError(f"port {port} is in use; port {self.port} is free: give --port {self.port}")
+        if first_motion is not None:
+            self.viewing.load_motion(*first_motion[1:])
+        self.scene = Scene(self.server, self.viewing, lambda joint: self.controls.choose_joint(joint))
+        self.controls = Controls(
+            self.server,
+            self.viewing,
+            self.scene,
+            motions,
+            load_motion or _no_motion,
+            facts or {},
+            first_motion[0] if first_motion else None,
+        )
+        if first_motion is not None:
+            self.viewing.play()
+        self._thread = threading.Thread(target=self._run, name="snarf-view", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Serve no more."""
+        self._is_stopped = True
+        self._woken.set()
+        self._thread.join(timeout=10)
+        self.viewing.stop()
+        self._stop_server()
+
+    def _stop_server(self) -> None:
+        with _silence():
+            self.server.stop()
+
+    def wait(self) -> None:
+        """Return when the page is not kept up to date any more; a signal such as Ctrl-C is heard meanwhile."""
+        while self._thread.is_alive():
+            self._thread.join(timeout=0.5)
+
+    def _run(self) -> None:
+        timeout: float | None = 0.0
+        while True:
+            self._woken.wait(timeout)
+            self._woken.clear()
+            if self._is_stopped:
+                return
+            start = time.monotonic()
+            try:
+                waits = self._step()
+            except Exception as error:  # one picture that fails must not end the viewer
+                log.error("the viewer goes on after: %s: %s", type(error).__name__, error, exc_info=error)
+                waits = [1.0]
+            timeout = min((wait for wait in waits if wait is not None), default=None)
+            rest = _SHORTEST_S - (time.monotonic() - start)
+            if rest > 0:  # changes that come meanwhile go into the next picture together
+                time.sleep(rest)
+            timeout = None if timeout is None else max(timeout - max(rest, 0.0), 0.0)
+
+    def _step(self) -> list[float | None]:
+        """Show the present picture; return for how many seconds each part is content."""
+        picture, frame_wait = self.viewing.picture()
+        self.scene.show(picture)
+        return [frame_wait, self.scene.advance(), self.controls.follow(picture)]
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep viser's own announcements, which no option turns off, from the terminal."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+def _no_motion(name: str) -> tuple[Any, Any]:
+    raise UserError(f"no motion '{name}'")

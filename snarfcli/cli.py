@@ -93,6 +93,14 @@ _COMMANDS = (
         {"--pose": "pose={}"},
     ),
     Command(
+        "view",
+        "view",
+        "ViewConfig",
+        "an avatar in the browser: pose it, play motions",
+        "snarf view --pose seq.npz subject=50002",
+        {"--pose": "pose=[{}]", "--port": "port={}", "--host": "host={}", "--no-open": "open=false"},
+    ),
+    Command(
         "doctor",
         "doctor",
         "DoctorConfig",

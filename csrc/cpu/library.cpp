@@ -7,6 +7,7 @@
 #include "blending.h"
 #include "complete_search.h"
 #include "dispatch.h"
+#include "network.h"
 #include "roots.h"
 #include "snarf/api.h"
 
@@ -195,4 +196,9 @@ int snarf_implicit_backward(const snarf_field* field, const snarf_queries* queri
     implicit_backward(*field, *queries, roots, static_cast<const S*>(gradient), static_cast<const S*>(canonical), query,
                       static_cast<const S*>(jacobian_inverse), static_cast<S*>(v_points), static_cast<S*>(v_transforms));
   });
+}
+
+int snarf_evaluate(const snarf_network* network, const float* points, const float* extras, int64_t count, int32_t threads, float* logits) {
+  if (!valid(network, points, extras, count, threads, logits)) return SNARF_BAD_ARGUMENT;
+  return in_number_type(4, [&](auto) { Network(*network).run(points, extras, count, threads, logits); });
 }

@@ -22,7 +22,7 @@ __all__ = [
     "why_unavailable",
 ]
 
-ABI_VERSION = 1
+ABI_VERSION = 2
 """Version of the C interface (csrc/include/snarf/api.h) that this code speaks."""
 
 _ENDINGS = {"darwin": "dylib", "win32": "dll"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,8 +28,11 @@ from snarfcli.models.snarf import Snarf
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, MeshTemplate, System
 
 if TYPE_CHECKING:
+    from snarfcli.export.exporting import ExportReport
+    from snarfcli.export.rig import Clip
     from snarfcli.meshing.mesh import Mesh
     from snarfcli.meshing.skinned import SkinnedSurface
+    from snarfcli.motions import Motion
 
 __all__ = ["SYSTEMS", "Avatar", "load_checkpoint"]
 
@@ -247,6 +250,46 @@ class Avatar:
         pose = torch.as_tensor(pose).reshape(-1, 3)
         translation = None if translation is None else torch.as_tensor(translation).reshape(3)
         return posed_mesh(self, pose, translation, resolution, surface=surface)
+
+    def export_glb(
+        self,
+        path: str | Path,
+        motions: Motion | Clip | Sequence[Motion | Clip],
+        *,
+        triangles: int | None = 20000,
+        influences: int = 4,
+        morph_targets: int = 8,
+        resolution: int = 256,
+        weight_colors: bool = False,
+        overwrite: bool = False,
+    ) -> ExportReport:
+        """Write a rigged, animated character as one `.glb` file, whole or not at all; `snarf export` does the same.
+
+        Args:
+            path: the file.
+            motions: a clip each; a `Clip` where joints stretch, so that it needs bone transforms.
+            triangles: at most; None leaves the mesh as it was extracted.
+            influences: joints that move one vertex, 4 or 8.
+            morph_targets: shapes that are blended for the pose-dependent shape, at most; 0 for the mean shape.
+            resolution: voxels along the longest side of the canonical box.
+            weight_colors: whether vertices are coloured by their skinning weights.
+            overwrite: whether a file that is there already is replaced.
+
+        Returns:
+            What was written, and how near it comes to `mesh(surface="skinned")`.
+
+        Raises:
+            ValueError: the system has no skinning weights, the field no surface, or an argument cannot be used.
+        """
+        from snarfcli.export.character import CharacterOptions
+        from snarfcli.export.exporting import export_character
+        from snarfcli.export.rig import Clip
+        from snarfcli.motions import Motion
+
+        several = [motions] if isinstance(motions, Motion | Clip) else motions
+        clips = [motion if isinstance(motion, Clip) else Clip(motion) for motion in several]
+        options = CharacterOptions(triangles, influences, morph_targets, resolution, weight_colors)
+        return export_character(self, path, clips, options, overwrite=overwrite)
 
 
 def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | None:

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid, SearchConfig
 from snarfcli.deformer.skinning import skin
+from snarfcli.models.inference import can_evaluate, evaluate
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.precision import network_precision
 from snarfcli.shape import CONDITIONS, OccupancyNetwork, joints_of_bones
@@ -132,12 +133,14 @@ class System(nn.Module):
             canonical: [M, 3], metres.
             condition: [B, C].
             pose: index of each point's pose, [M].
-            precision: of the network.
+            precision: of the network, but not where the native library evaluates it, which is in full float32 and faster.
             weights: skinning weights of the points [M, J], where the system has them; else they are looked up if need be.
         """
         seen = None
         if self.config.condition.name == "local":
             seen = self.seen_joints(self.canonical_weights(canonical) if weights is None else weights)
+        if can_evaluate(self.shape, canonical):
+            return evaluate(self.shape, canonical, condition, pose, seen)
         with network_precision(precision, canonical.device):
             if torch.is_grad_enabled():
                 extra = -len(canonical) % _ROUND_NUMBER if canonical.device.type == "cpu" else 0

@@ -11,9 +11,9 @@ from torch.nn import functional as F
 
 from snarfcli.segments import distance_to_segments
 
-__all__ = ["LOGITS_PER_METRE", "OccupancyNetwork", "ShapeConfig"]
+__all__ = ["LOGITS_PER_METRE", "SOFTPLUS_SHARPNESS", "OccupancyNetwork", "ShapeConfig"]
 
-_SOFTPLUS_SHARPNESS = 100.0  # as in the papers' code
+SOFTPLUS_SHARPNESS = 100.0  # as in the papers' code
 LOGITS_PER_METRE = 30.0
 """Slope of a capsule prior across its surface."""
 
@@ -130,7 +130,7 @@ class OccupancyNetwork(nn.Module):
             else:
                 h = layer(h)
             if index < len(self.layers) - 1:
-                h = F.relu(h) if self.config.activation == "relu" else F.softplus(h, beta=_SOFTPLUS_SHARPNESS)
+                h = F.relu(h) if self.config.activation == "relu" else F.softplus(h, beta=SOFTPLUS_SHARPNESS)
         logits = h[:, 0]
         if self.config.prior_radius_m is not None:
             distance = distance_to_segments(canonical, self.bones)

@@ -15,7 +15,7 @@
 extern "C" {
 #endif
 
-#define SNARF_ABI_VERSION 1
+#define SNARF_ABI_VERSION 2
 
 enum { SNARF_OK = 0, SNARF_BAD_ARGUMENT = 1, SNARF_OUT_OF_MEMORY = 2 };
 
@@ -61,6 +61,29 @@ typedef struct snarf_blending {
   int32_t threads;         /* at most */
 } snarf_blending;
 
+/* A layer: activation(weights [previous; encoded point; extras] + bias), where it takes only what it says. */
+typedef struct snarf_layer {
+  const float* weights;    /* [outputs, inputs], columns in the order above */
+  const float* bias;       /* [outputs] */
+  int32_t outputs;
+  int32_t takes_point;     /* the first layer must */
+  int32_t takes_extras;
+  int32_t activation;      /* 0: none, 1: ReLU, 2: softplus */
+} snarf_layer;
+
+/* A canonical occupancy network (SNARF Eq. 1) in one pose; the last layer has one output. */
+typedef struct snarf_network {
+  const snarf_layer* layers;
+  int32_t layer_count;
+  const float* frequencies;  /* radians a metre, [K]: the encoded point is x, sin(k x) for each k, cos(k x) for each k */
+  int32_t frequency_count;
+  const float* segments;     /* bones, [S, 2, 3], metres */
+  int32_t segment_count;     /* S; 0 for no capsules */
+  float radius, slope;       /* slope * (radius - distance to the nearest bone) is added */
+  float sharpness;           /* of the softplus */
+  int32_t extra_count;       /* E, values of each point's own */
+} snarf_network;
+
 typedef struct snarf_roots snarf_roots;
 
 SNARF_API int snarf_abi_version(void);
@@ -84,6 +107,9 @@ SNARF_API int snarf_take_roots(snarf_roots* roots, void* canonical, int64_t* que
 SNARF_API int snarf_implicit_backward(const snarf_field*, const snarf_queries*, int64_t roots, const void* gradient,
                                       const void* canonical, const int64_t* query, const void* jacobian_inverse, void* v_points,
                                       void* v_transforms);
+
+/* Logits [N] at points [N, 3], metres, with extras [N, E]; always float. A point's result does not depend on the others. */
+SNARF_API int snarf_evaluate(const snarf_network*, const float* points, const float* extras, int64_t count, int32_t threads, float* logits);
 
 #ifdef __cplusplus
 }

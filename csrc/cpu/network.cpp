@@ -1,0 +1,200 @@
+// The canonical occupancy network without gradients, compiled once per instruction set.
+//
+// DESIGN. A tile of points runs through all layers before the next one starts; one lane is one point, and an array of values is
+// [value, point], so that activations, the encoding and the distance to the bones need no shuffles. A layer is summed for six
+// outputs and a few packs of points at once: their sums fill the registers, each value loaded serves six products and each
+// weight a pack for every product, so the multipliers and not the memory set the pace. Weights are packed in the order of use.
+#include <math.h>
+
+#include "lanes.h"
+#include "network_task.h"
+
+namespace snarf {
+namespace SNARF_ISA {
+namespace {
+
+using V = Lanes<float>;
+constexpr int kPacks = kVectorBytes == 64 ? 4 : 2;  // of points at once: 24 sums of 32 registers, or 12 of 16
+constexpr int kColumn = kPacks * V::width;
+static_assert(kTile % kColumn == 0, "tiles are made of whole columns");
+
+// sums[o][p] += weights[k][o] * values[k][p] for all k.
+SNARF_HD void add_products(const float* weights, const float* values, int count, V (*sums)[kPacks]) {
+  for (int k = 0; k < count; ++k) {
+    V value[kPacks];
+    SNARF_UNROLL
+    for (int p = 0; p < kPacks; ++p) value[p] = load<float>(values + k * kTile + p * V::width);
+    SNARF_UNROLL
+    for (int o = 0; o < kOutputs; ++o) {
+      const V weight(weights[k * kOutputs + o]);
+      SNARF_UNROLL
+      for (int p = 0; p < kPacks; ++p) sums[o][p] = sums[o][p] + weight * value[p];
+    }
+  }
+}
+
+// e^x for x <= 0, to 4e-6 of it down to -20; smaller ones count as that.
+SNARF_HD V decay(V x) {
+  const V y = larger(x, V(-20.f)) * V(1.f / 64);
+  V e = V(1.f / 720);
+  e = e * y + V(1.f / 120);
+  e = e * y + V(1.f / 24);
+  e = e * y + V(1.f / 6);
+  e = e * y + V(0.5f);
+  e = e * y + V(1.f);
+  e = e * y + V(1.f);
+  SNARF_UNROLL
+  for (int i = 0; i < 6; ++i) e = e * e;
+  return e;
+}
+
+// log(1 + e^(s x)) / s. NaN stays NaN.
+SNARF_HD V softplus(V x, float sharpness) {
+  const V positive = select(x <= 0.f, V(0.f), x);
+  const V scaled = absolute(x) * sharpness;
+  if (!any(scaled < 20.f)) return positive;  // the rest is below what a float resolves
+  // log(1 + e) = 2 artanh(e / (2 + e)), whose argument is at most a third
+  const V e = decay(V(0.f) - scaled);
+  const V t = e / (e + 2.f), q = t * t;
+  V series = q * V(1.f / 11) + V(1.f / 9);
+  series = series * q + V(1.f / 7);
+  series = series * q + V(1.f / 5);
+  series = series * q + V(1.f / 3);
+  series = series * q + V(1.f);
+  return positive + series * t * V(2.f / sharpness);
+}
+
+SNARF_HD V activated(V x, int activation, float sharpness) {
+  if (activation == 1) return select(x <= 0.f, V(0.f), x);
+  return activation == 2 ? softplus(x, sharpness) : x;
+}
+
+void run_layer(const NetworkLayer& layer, const float* hidden, const float* encoded, const float* extras, float sharpness, float* out) {
+  const int inputs = layer.hidden + layer.encoded + layer.extras;
+  for (int o = 0; o < layer.outputs; o += kOutputs) {
+    const float* const weights = layer.weights + int64_t(o) * inputs;
+    for (int column = 0; column < kTile; column += kColumn) {
+      V sums[kOutputs][kPacks];
+      SNARF_UNROLL
+      for (int i = 0; i < kOutputs; ++i)
+        SNARF_UNROLL
+        for (int p = 0; p < kPacks; ++p) sums[i][p] = V(layer.bias[o + i]);
+      add_products(weights, hidden + column, layer.hidden, sums);
+      add_products(weights + kOutputs * layer.hidden, encoded + column, layer.encoded, sums);
+      add_products(weights + kOutputs * (layer.hidden + layer.encoded), extras + column, layer.extras, sums);
+      SNARF_UNROLL
+      for (int i = 0; i < kOutputs; ++i)
+        SNARF_UNROLL
+        for (int p = 0; p < kPacks; ++p)
+          store(out + (o + i) * kTile + column + p * V::width, activated(sums[i][p], layer.activation, sharpness));
+    }
+  }
+}
+
+// Sine and cosine of angles up to some thousands, to 2e-7 (Cody and Waite's reduction by quarter turns, then Taylor's series).
+SNARF_HD void sine_cosine(V angle, V& sine, V& cosine) {
+  const V turns = angle * V(0.63661977236758134f);
+  const V quarter = truncate(turns + select(turns >= 0.f, V(0.5f), V(-0.5f)));
+  V r = angle - quarter * V(1.5703125f);
+  r = r - quarter * V(4.83751296997e-4f);
+  r = r - quarter * V(7.549789948769e-8f);
+  const V q = r * r;
+  V s = q * V(2.7557319e-6f) + V(-1.9841270e-4f);
+  s = s * q + V(8.3333333e-3f);
+  s = s * q + V(-1.6666667e-1f);
+  s = s * q * r + r;
+  V c = q * V(-2.7557319e-7f) + V(2.4801587e-5f);
+  c = c * q + V(-1.3888889e-3f);
+  c = c * q + V(4.1666667e-2f);
+  c = c * q + V(-0.5f);
+  c = c * q + V(1.f);
+  const V half = truncate(quarter * V(0.5f)), fourth = truncate(quarter * V(0.25f));
+  const V odd = absolute(quarter - half * V(2.f));       // 1 on odd quarters
+  const V rest = quarter - fourth * V(4.f);              // -3 to 3
+  const LaneMask<float> swap = odd > 0.5f;
+  const LaneMask<float> sine_down = ((rest >= 1.5f) & (rest <= 3.5f)) | ((rest >= -2.5f) & (rest <= -0.5f));
+  const LaneMask<float> cosine_down = ((rest >= 0.5f) & (rest <= 2.5f)) | ((rest >= -3.5f) & (rest <= -1.5f));
+  const V a = select(swap, c, s), b = select(swap, s, c);
+  sine = select(sine_down, V(0.f) - a, a);
+  cosine = select(cosine_down, V(0.f) - b, b);
+}
+
+// The points themselves, then sines of all axes and frequencies, then cosines, as OccupancyNetwork._encode has them.
+void encode(const NetworkTask& task, const float* points, float* encoded) {
+  const int waves = 3 * task.frequency_count;
+  for (int axis = 0; axis < 3; ++axis)
+    for (int i = 0; i < kTile; i += V::width) {
+      const V x = load<float>(points + axis * kTile + i);
+      store(encoded + axis * kTile + i, x);
+      for (int f = 0; f < task.frequency_count; ++f) {
+        V sine, cosine;
+        sine_cosine(x * V(task.frequencies[f]), sine, cosine);
+        store(encoded + (3 + 3 * f + axis) * kTile + i, sine);
+        store(encoded + (3 + waves + 3 * f + axis) * kTile + i, cosine);
+      }
+    }
+}
+
+// Adds the capsules around the bones (snarfcli/segments.py).
+void add_capsules(const NetworkTask& task, const float* points, float* values) {
+  for (int i = 0; i < kTile; i += V::width) {
+    V x[3], nearest(3.4e38f);
+    for (int axis = 0; axis < 3; ++axis) x[axis] = load<float>(points + axis * kTile + i);
+    for (int s = 0; s < task.segment_count; ++s) {
+      const float* const start = task.segments + 6 * s;
+      float along[3], length = 0;
+      for (int axis = 0; axis < 3; ++axis) {
+        along[axis] = start[3 + axis] - start[axis];
+        length += along[axis] * along[axis];
+      }
+      V from[3], share(0.f), squared(0.f);
+      for (int axis = 0; axis < 3; ++axis) {
+        from[axis] = x[axis] - start[axis];
+        share = share + from[axis] * along[axis];
+      }
+      share = smaller(larger(share * V(1.f / (length > 1e-12f ? length : 1e-12f)), V(0.f)), V(1.f));
+      for (int axis = 0; axis < 3; ++axis) {
+        const V away = from[axis] - share * along[axis];
+        squared = squared + away * away;
+      }
+      nearest = smaller(squared, nearest);
+    }
+    float distance[V::width];
+    store(distance, larger(nearest, V(1e-12f)));
+    for (int lane = 0; lane < V::width; ++lane) distance[lane] = sqrtf(distance[lane]);
+    store(values + i, load<float>(values + i) + (V(task.radius) - load<float>(distance)) * task.slope);
+  }
+}
+
+void run_network(const NetworkTask& task, int64_t first, int64_t last, float* scratch) {
+  const int64_t tile = kTile;
+  float* const encoded = scratch;
+  float* const extras = encoded + tile * (3 + 6 * task.frequency_count);
+  float* values = extras + tile * task.extra_count;
+  float* next = values + tile * task.widest;
+  for (int64_t begin = first; begin < last; begin += tile) {
+    const int count = int(last - begin < tile ? last - begin : tile);
+    float points[3 * kTile];
+    for (int i = 0; i < kTile; ++i) {
+      const int64_t row = begin + (i < count ? i : count - 1);  // the last tile repeats its last point
+      for (int axis = 0; axis < 3; ++axis) points[axis * kTile + i] = task.points[3 * row + axis];
+      for (int e = 0; e < task.extra_count; ++e) extras[e * tile + i] = task.extras[row * task.extra_count + e];
+    }
+    encode(task, points, encoded);
+    for (int n = 0; n < task.layer_count; ++n) {
+      run_layer(task.layers[n], values, encoded, extras, task.sharpness, next);
+      float* const before = values;
+      values = next;
+      next = before;
+    }
+    if (task.segment_count) add_capsules(task, points, values);
+    for (int i = 0; i < count; ++i) task.out[begin + i] = values[i];
+  }
+}
+
+}  // namespace
+
+NetworkKernel network_kernel() { return run_network; }
+
+}  // namespace SNARF_ISA
+}  // namespace snarf

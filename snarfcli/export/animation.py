@@ -253,5 +253,8 @@ def _make_some(
     # Whoever started it ends it so; leaving in order takes a half-written file along.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     torch.set_num_threads(threads)
-    for index in numbers:
-        yield animation.make(index)
+    try:
+        for index in numbers:
+            yield animation.make(index)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # nothing is half-written any more

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,10 +65,18 @@ class Camera:
             depth = np.maximum(distance - z, 1e-6)
             middle = [(np.min(v / depth) + np.max(v / depth)) / 2 * distance for v in (x, y)]
             target = target + middle[0] * right + middle[1] * up
-        offset = points - target
-        x, y, z = offset @ right, offset @ up, offset @ backward
-        distance = max(float((z + np.maximum(np.abs(x) / slope_x, np.abs(y) / slope_y)).max()), 1e-3)
-        return cls(tuple(map(float, target + distance * backward)), tuple(map(float, target)), fov_rad)
+        near = cls(tuple(map(float, target + backward)), tuple(map(float, target)), fov_rad)
+        return near.at(near.distance_to_see(points, aspect=aspect, margin=margin))
+
+    def distance_to_see(self, points: np.ndarray, *, aspect: float = 1.0, margin: float = 0.07) -> float:
+        """Return how far from its target the camera must be to have all points [N, 3] in the picture; see `framing`."""
+        slope_y = math.tan(self.fov_rad / 2) * (1 - 2 * margin)
+        x, y, z = self.axes @ (np.asarray(points, dtype=np.float64) - self.target).T
+        return max(float((z + np.maximum(np.abs(x) / (slope_y * aspect), np.abs(y) / slope_y)).max()), 1e-3)
+
+    def at(self, distance: float) -> Camera:
+        """Return the camera at another distance from its target, metres."""
+        return replace(self, position=tuple(map(float, self.target + distance * self.axes[2])))
 
     @property
     def axes(self) -> np.ndarray:

@@ -19,8 +19,8 @@ from snarfcli.export.lighting import PATTERN, LitScene, Look
 __all__ = ["Backdrop", "Ground"]
 
 _CELLS = 112  # shadow grid, each way: 2 to 3 cm for a standing body
-_LINE_SHARE = 0.012  # width of a line of the floor's pattern over its spacing
-_LINE_SHADE = 0.13  # how much darker a line is: to be seen when it moves, not to be looked at
+_LINE_SHARE = 0.014  # width of a line of the floor's pattern over its spacing
+_LINE_SHADE = 0.17  # how much darker a line is: to be seen when it moves, not to be looked at
 
 
 @dataclass(frozen=True)

@@ -63,9 +63,7 @@ class Stage:
     def camera_on(self, view: int, frame: int, middle: np.ndarray) -> Camera:
         """Return the camera of one view for something that stays over `middle` [3], from as far and as high."""
         camera = self.camera(view, frame)
-        target = np.array([middle[0], self.cameras[view].target[1], middle[2]])
-        offset = np.subtract(camera.position, camera.target)
-        return replace(camera, position=tuple(map(float, target + offset)), target=tuple(map(float, target)))
+        return _aimed(camera, np.array([middle[0], camera.target[1], middle[2]]))
 
 
 @torch.no_grad()
@@ -142,17 +140,21 @@ def set_stage(
         return Camera.framing(what, aspect=aspect, azimuth_rad=azimuth_rad, elevation_rad=view.elevation_rad)
 
     cameras = [framing(seen, view) for view in views]
-    around = cameras if beside is None else [*cameras, *(framing(beside, view) for view in views)]
-    distance = max(float(np.linalg.norm(np.subtract(one.position, one.target))) for one in around)
+    others = [] if beside is None else [framing(beside, view) for view in views]
     # Side by side, the floor should be at one height.
-    level = [one.target[1] for one, view in zip(cameras, views, strict=True) if not view.is_from_above]
+    pairs = [*zip(cameras, views, strict=True), *zip(others, views, strict=False)]
+    heights = [one.target[1] for one, view in pairs if not view.is_from_above]
     for index, (one, view) in enumerate(zip(cameras, views, strict=True)):
-        height = one.target[1] if view.is_from_above else float(np.mean(level))
-        target = np.array([one.target[0], height, one.target[2]])
+        x, y, z = one.target
+        target = np.array([x, y if view.is_from_above else float(np.mean(heights)), z])
         if turn_rad_s:
             target[[0, 2]] = pivot[[0, 2]]
-        position = target + distance * one.axes[2]
-        cameras[index] = replace(one, position=tuple(map(float, position)), target=tuple(map(float, target)))
+        cameras[index] = _aimed(one, target)
+    distances = [one.distance_to_see(seen, aspect=aspect) for one in cameras]
+    if beside is not None:
+        aimed = [_aimed(one, np.array([0.0, one.target[1], 0.0])) for one in cameras]
+        distances += [one.distance_to_see(beside, aspect=aspect) for one in aimed]
+    cameras = [one.at(max(distances)) for one in cameras]
     moves = camera != "still" or bool(turn_rad_s)
     tall = float(np.median(np.ptp(points[..., 1], axis=1)))
     return Stage(
@@ -164,6 +166,12 @@ def set_stage(
         turn_rad_s * np.arange(len(points)) / frame_rate,
         heading_rad,
     )
+
+
+def _aimed(camera: Camera, target: np.ndarray) -> Camera:
+    """Return the camera moved aside so that it looks at another point the same way."""
+    position = target + np.subtract(camera.position, camera.target)
+    return replace(camera, position=tuple(map(float, position)), target=tuple(map(float, target)))
 
 
 def _smooth(places: np.ndarray, frame_rate: float) -> np.ndarray:

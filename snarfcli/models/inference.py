@@ -1,9 +1,10 @@
-"""The canonical occupancy network without gradients on a CPU, by the native library: several times faster than layer by layer."""
+"""The occupancy network without gradients on a CPU, by the native library: several times faster than layer by layer."""
 
 from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Iterator
 from ctypes import Structure, byref, c_float, c_int32, c_int64, c_void_p
 
 import torch
@@ -84,61 +85,38 @@ def evaluate(
 def _evaluate(network: OccupancyNetwork, canonical: Tensor, condition: Tensor, seen: Tensor | None) -> Tensor:
     """Evaluate points of one pose; `condition` [C]."""
     config = network.config
-    local = network.conditioned and seen is not None
-    kept = [canonical.contiguous(), network.frequencies.float().contiguous(), network.bones.float().contiguous()]
-    extras = seen.float().contiguous() if local else None
-    layers = (_Layer * len(network.layers))()
-    hidden = 0
-    for index, layer in enumerate(network.layers):
-        takes_point = index == 0 or index in config.skip_layers
-        weight, bias = layer.weight, layer.bias
-        joined = network.conditioned and index == config.condition_layer
-        if joined:
-            points = weight.shape[1] - config.condition_size
-            code = weight[:, points:]
-            weight = weight[:, :points]
-            if local:
-                parts = extras.shape[1]
-                # The code is linear in what a point sees: one row of weights for each part of the condition.
-                codes = torch.einsum("pc,kpc->kp", condition.view(parts, -1), network.pose_code.weight.unflatten(1, (parts, -1)))
-                bias = bias + code @ network.pose_code.bias
-                extra_weight = code @ codes
-            else:
-                bias = bias + code @ network.pose_code(condition)
-        if index > 0 and index in config.skip_layers:
-            weight = weight / math.sqrt(2)
-        if joined and local:
-            weight = torch.cat([weight, extra_weight], 1)
-        weight, bias = weight.contiguous(), bias.contiguous()
-        kept += [weight, bias]
-        last = index == config.depth
+    extras = seen.float().contiguous() if network.conditioned and seen is not None else None
+    count = 0 if extras is None else extras.shape[1]
+    tensors = list(_layer_tensors(network, condition, count))  # they must outlive the call, as all else that is pointed to
+    layers = (_Layer * len(tensors))()
+    for index, (weight, bias) in enumerate(tensors):
         layers[index] = _Layer(
             weight.data_ptr(),
             bias.data_ptr(),
             len(bias),
-            takes_point,
-            joined and local,
-            0 if last else _ACTIVATIONS[config.activation],
+            index == 0 or index in config.skip_layers,
+            count > 0 and index == config.condition_layer,
+            _ACTIVATIONS[config.activation] if index < config.depth else 0,
         )
-    has_prior = config.prior_radius_m is not None
+    points, frequencies, bones = (values.float().contiguous() for values in (canonical, network.frequencies, network.bones))
     native = _Network(
         ctypes.cast(layers, c_void_p),
         len(layers),
-        kept[1].data_ptr(),
-        len(kept[1]),
-        kept[2].data_ptr(),
-        len(kept[2]) if has_prior else 0,
+        frequencies.data_ptr(),
+        len(frequencies),
+        bones.data_ptr(),
+        0 if config.prior_radius_m is None else len(bones),
         config.prior_radius_m or 0.0,
         LOGITS_PER_METRE,
         SOFTPLUS_SHARPNESS,
-        extras.shape[1] if local else 0,
+        count,
     )
-    out = canonical.new_empty(len(canonical))
+    out = points.new_empty(len(points))
     code = native_library().snarf_evaluate(
         byref(native),
-        c_void_p(kept[0].data_ptr()),
-        c_void_p(extras.data_ptr() if local else None),
-        c_int64(len(canonical)),
+        c_void_p(points.data_ptr()),
+        c_void_p(None if extras is None else extras.data_ptr()),
+        c_int64(len(points)),
         c_int32(torch.get_num_threads()),
         c_void_p(out.data_ptr()),
     )
@@ -147,3 +125,26 @@ def _evaluate(network: OccupancyNetwork, canonical: Tensor, condition: Tensor, s
     if code:
         raise RuntimeError(f"the native library refused the network (code {code})")
     return out
+
+
+def _layer_tensors(network: OccupancyNetwork, condition: Tensor, parts: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield weight and bias of each layer in one pose [C]: columns for the layer before, the encoded point, the parts seen.
+
+    The pose code becomes a part of the bias, or, where points see `parts` of the condition, that many columns, since it is
+    linear in what they see.
+    """
+    config = network.config
+    for index, layer in enumerate(network.layers):
+        weight, bias = layer.weight, layer.bias
+        columns = []
+        if network.conditioned and index == config.condition_layer:
+            weight, code = weight.tensor_split([weight.shape[1] - config.condition_size], dim=1)
+            if parts:
+                mapping = network.pose_code.weight.unflatten(1, (parts, -1))  # [K, P, C / P]
+                columns = [code @ torch.einsum("pc,kpc->kp", condition.view(parts, -1), mapping)]
+                bias = bias + code @ network.pose_code.bias
+            else:
+                bias = bias + code @ network.pose_code(condition)
+        if index > 0 and index in config.skip_layers:
+            weight = weight / math.sqrt(2)
+        yield torch.cat([weight, *columns], 1).contiguous(), bias.contiguous()

@@ -131,7 +131,8 @@ def test_other_instruction_sets(name):
         "import torch, test_inference as t; from snarfcli.deformer.library import instruction_set;"
         f"assert instruction_set() == '{name}';"
         "[t.test_agrees_with_the_network(*case) for case in t.CASES];"
-        "t.test_far_steep_and_broken_points(); t.test_waves_of_large_angles(); t.test_a_point_does_not_depend_on_the_others(129)"
+        "t.test_far_steep_and_broken_points(); t.test_waves_of_large_angles();"
+        "t.test_a_point_does_not_depend_on_the_others(129)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],

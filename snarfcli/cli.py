@@ -48,7 +48,7 @@ class Command:
     example: str
     """A call that works on a fresh machine once the commands before it have run."""
     flags: dict[str, str]
-    """Flags and the overrides they stand for; `{}` takes the flag's value."""
+    """Flags and the overrides they stand for; `{}` takes the flag's value, `[{}]` those of all times that it is given."""
     positional: str | None = None
     """Setting whose value may stand first, without its name."""
     lists_of_settings: tuple[str, ...] = ()
@@ -91,6 +91,14 @@ _COMMANDS = (
         "posed meshes and a video of a motion",
         "snarf animate --pose seq.npz subject=50002",
         {"--pose": "pose={}"},
+    ),
+    Command(
+        "export",
+        "export",
+        "ExportConfig",
+        "a rigged, animated character for other programs: glb, fbx, usd, or a mesh a frame",
+        "snarf export --pose a.npz --pose b.bvh subject=50002",
+        {"--pose": "pose=[{}]"},
     ),
     Command(
         "view",
@@ -229,6 +237,7 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
     """
     out: list[str] = []
     flags: list[str] = []
+    collected: dict[str, list[str]] = {}
     rest = list(arguments)
     if command.positional and rest and "=" not in rest[0] and not rest[0].startswith(("-", "~")):
         out.append(f"{command.positional}={quote(rest.pop(0))}")
@@ -242,6 +251,9 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
                     if not rest:
                         raise UserError(f"{name} needs a value, such as {name} FILE")
                     value = rest.pop(0)
+                if "[{}]" in override:
+                    collected.setdefault(override, []).append(quote(value))
+                    continue
                 override = override.format(quote(value))
             elif equals:
                 raise UserError(f"{name} takes no value, got {argument!r}")
@@ -257,6 +269,7 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
             raise UserError(f"{argument!r} is no setting; write name=value; see \"snarf {command.name} --help\"")
         else:
             out.append(f"{name}={quote_items(value)}" if name in command.lists_of_settings else argument)
+    out += [override.format(",".join(values)) for override, values in collected.items()]
     return out + flags
 
 

@@ -8,7 +8,7 @@ from snarfcli import cli
 from snarfcli.errors import UserError
 from snarfcli.settings import describe, group_schemas, setting_names
 
-COMMANDS = ("preprocess", "train", "eval", "animate", "doctor", "reproduce")
+COMMANDS = ("preprocess", "train", "eval", "animate", "export", "doctor", "reproduce")
 
 
 @pytest.fixture(autouse=True)

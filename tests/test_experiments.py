@@ -10,6 +10,8 @@ import yaml
 from snarfcli import cli
 from snarfcli.settings import config_folder, group_options, preset_groups
 
+NAMES = ("preprocess", "train", "eval", "animate", "export")
+
 
 def composed(capsys, *arguments):
     """Return the configuration that a command would run with."""
@@ -25,7 +27,7 @@ def elsewhere(tmp_path, monkeypatch):
 
 
 def test_none_is_chosen_by_default(capsys):
-    for command in ("preprocess", "train", "eval", "animate"):
+    for command in NAMES:
         assert composed(capsys, command)["experiment"] is None
 
 
@@ -52,7 +54,7 @@ def test_single_settings_and_other_choices_win(capsys):
 
 
 def test_smoke_is_one_small_folder_for_every_command(capsys):
-    configs = {name: composed(capsys, name, "experiment=smoke") for name in ("preprocess", "train", "eval", "animate")}
+    configs = {name: composed(capsys, name, "experiment=smoke") for name in NAMES}
     assert {config["experiment"] for config in configs.values()} == {"smoke"}
     (root,) = {config["data_root"] for config in configs.values()}
     assert root != composed(capsys, "train")["data_root"]  # full samples stay as they are
@@ -63,7 +65,7 @@ def test_smoke_is_one_small_folder_for_every_command(capsys):
 
 
 def test_help_lists_them_and_every_one_says_its_name(capsys):
-    for name in ("preprocess", "train", "eval", "animate"):
+    for name in NAMES:
         command = cli.COMMANDS[name]
         schema = getattr(importlib.import_module(f"snarfcli.commands.{command.module}"), command.schema)
         assert preset_groups(schema, name) == {"experiment": f"experiment/{name}"}

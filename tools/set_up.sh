@@ -24,4 +24,12 @@ if ! "$venv/bin/python" -c 'import torch' 2>/dev/null; then
     fi
 fi
 $pip install --quiet --editable '.[test]'
+# Readers of glTF that are not ours, for the tests, which are skipped without them: npm or the network may be missing.
+readers=build/readers
+if command -v npm >/dev/null 2>&1 && ! cmp -s tests/readers/package.json $readers/package.json; then
+    mkdir -p $readers.new && cp tests/readers/package.json $readers.new/ &&
+        npm install --prefix $readers.new --no-audit --no-fund --silent --fetch-retries=1 --fetch-timeout=30000 &&
+        rm -rf $readers && mv $readers.new $readers ||
+        echo "three.js and the Khronos validator could not be installed into $readers; their tests are skipped" >&2
+fi
 touch "$venv/.snarf-installed"

@@ -1,0 +1,190 @@
+"""`snarf export`: an avatar as a rigged, animated character for other programs."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from omegaconf import MISSING
+
+from snarfcli.checks import check_choice
+from snarfcli.commands.choices import (
+    AvatarChoice,
+    MotionChoice,
+    check_motion_choice,
+    choose_motion,
+    load_chosen_avatar,
+)
+from snarfcli.errors import UserError
+from snarfcli.export.blender import BLENDER_FORMATS, convert, find_blender
+from snarfcli.export.character import CharacterOptions, character_surface, check_options
+from snarfcli.export.exporting import ExportReport, check_output, export_character
+from snarfcli.export.meshes import MESH_WRITERS
+from snarfcli.export.rig import Clip
+from snarfcli.export.sequence import atomic_folder, check_folder, write_sequence
+from snarfcli.files import write_json
+from snarfcli.models.avatar import Avatar
+from snarfcli.runs import machine_facts, run_folder
+
+__all__ = ["ExportConfig", "run"]
+
+log = logging.getLogger(__name__)
+
+_FORMATS = ("glb", *MESH_WRITERS, *BLENDER_FORMATS)
+_RECORD = "export.json"
+
+
+@dataclass
+class ExportConfig(MotionChoice, AvatarChoice):
+    """Settings of `snarf export`."""
+
+    pose: list[str] = MISSING
+    """Motion files, each a clip: .npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf, or a folder of frames."""
+    motion: list[str] = MISSING
+    """Built-in motions of SMPL's joints, or sequences of the samples of any other skeleton, each a clip; with neither these nor
+    pose files there is one clip, jumping_jacks or the held-out sequence."""
+    format: str = MISSING
+    """glb (mesh, rig, clips and shapes in one file), fbx or usd (the same, through Blender), ply or obj (a mesh a frame)."""
+    triangles: int | None = MISSING
+    """Most triangles of the mesh; null leaves it as it was extracted."""
+    influences: int = MISSING
+    """Joints that move one vertex: 4, or 8, which fewer programs read."""
+    morph_targets: int = MISSING
+    """Most shapes that are blended for the pose-dependent shape; 0 for one shape, the mean over the clips."""
+    resolution: int = MISSING
+    """Voxels along the longest side of the canonical box, from which the mesh is made."""
+    weight_colors: bool = MISSING
+    """Whether vertices are coloured by their skinning weights."""
+    output: str | None = MISSING
+    """File, or folder for ply and obj; null for export/<subject>.<format> beside the avatar."""
+    overwrite: bool = MISSING
+    """Whether what is there already is replaced."""
+    experiment: str | None = None
+    """Name of the preset of settings that the rest starts from; null for none."""
+
+
+def run(config: ExportConfig) -> int:
+    """Write the character and a record of it beside it.
+
+    Returns:
+        0, or 1 if the shape could not be followed in some frames.
+
+    Raises:
+        UserError: there is no avatar or no motion, or a setting cannot be used.
+    """
+    options = _check(config)
+    blender = find_blender() if config.format in BLENDER_FORMATS else []
+    if config.output is not None:  # before anything is loaded; the other place is known once the avatar is
+        _check_place(config, Path(config.output))
+    elif config.ckpt is None:
+        trained_on = config.data.avatars or config.data.name
+        _check_place(config, _place(config, run_folder(config.output_root, trained_on, config.subject, config.run)))
+    avatar, path = load_chosen_avatar(config)
+    output = Path(config.output) if config.output else _place(config, path.parent)
+    _check_place(config, output)
+    clips = _clips(config, avatar)
+    if config.format == "usd" and len(clips) > 1:
+        raise UserError(f"usd holds one timeline, got {len(clips)} motions; export them one by one, or give format=glb")
+    log.info("avatar: %s, on %s", path, avatar.device)
+    for clip in clips:
+        log.info("motion: %s, %d frames at %g a second", clip.motion.name, clip.motion.num_frames, clip.motion.frame_rate)
+    start = time.perf_counter()
+    write = _write_meshes if config.format in MESH_WRITERS else _write_character
+    facts, lines, skipped = write(config, avatar, clips, options, output, blender)
+    seconds = round(time.perf_counter() - start, 2)
+    record = output / _RECORD if output.is_dir() else output.with_name(f"{output.stem}_{output.suffix[1:]}.json")
+    write_json(record, {"config": asdict(config), "avatar": str(path), **facts, "seconds": seconds, **machine_facts()})
+    for line in lines:
+        log.info("%s", line)
+    for name, frame, reason in skipped:
+        log.warning("clip %s, frame %d: the shape could not be followed: %s", name, frame, reason)
+    return 1 if skipped else 0
+
+
+def _check(config: ExportConfig) -> CharacterOptions:
+    """Refuse settings that cannot be used, before any work starts; return what the character may cost."""
+    check_choice("format", config.format, _FORMATS)
+    options = CharacterOptions(
+        triangles=config.triangles,
+        influences=config.influences,
+        morph_targets=config.morph_targets,
+        resolution=config.resolution,
+        weight_colors=config.weight_colors,
+    )
+    check_options(options)
+    check_motion_choice(config)
+    return options
+
+
+def _place(config: ExportConfig, folder: Path) -> Path:
+    """Return where the result goes if nobody says so: a file, or for meshes a folder."""
+    joint = "_" if config.format in MESH_WRITERS else "."
+    return folder / "export" / f"{config.subject}{joint}{config.format}"
+
+
+def _check_place(config: ExportConfig, output: Path) -> None:
+    """Refuse a place that is taken, or a name that says another format."""
+    if config.format in MESH_WRITERS:
+        check_folder(output, config.overwrite)
+        return
+    suffix = output.suffix.lower().lstrip(".")
+    if suffix != config.format:
+        hint = f"give format={suffix}, or " if suffix in (*BLENDER_FORMATS, "glb") else ""
+        raise UserError(f"output {output} should end in .{config.format}; {hint}give another name")
+    check_output(output, config.overwrite)
+
+
+def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:
+    """Read all motions."""
+    wanted: list[tuple[str | None, str | None]] = [(pose, None) for pose in config.pose]
+    wanted += [(None, motion) for motion in config.motion]
+    clips = []
+    for pose, motion in wanted or [(None, None)]:
+        chosen = choose_motion(config, config, avatar.skeleton, pose, motion)
+        clips.append(Clip(chosen.motion, chosen.bone_transforms))
+    return clips
+
+
+_Written = tuple[dict[str, Any], list[str], tuple[tuple[str, int, str], ...]]
+"""Facts for the record, lines for people, and frames whose shape could not be followed."""
+
+
+def _write_character(
+    config: ExportConfig, avatar: Avatar, clips: list[Clip], options: CharacterOptions, output: Path, blender: list[str]
+) -> _Written:
+    """Write the file; in a format of Blender's from a temporary .glb."""
+    export: Callable[[Path], ExportReport] = lambda path: export_character(  # noqa: E731
+        avatar, path, clips, options, name=config.subject, overwrite=config.overwrite
+    )
+    if not blender:
+        report = export(output)
+        size = report.num_bytes
+    else:
+        rates = {clip.motion.frame_rate for clip in clips}
+        if len(rates) > 1:
+            log.warning("the motions have several frame rates, %s has one: %g", config.format, clips[0].motion.frame_rate)
+        with TemporaryDirectory() as folder:
+            glb = Path(folder) / f"{config.subject}.glb"
+            report = export(glb)
+            log.info("converting to %s in Blender", config.format)
+            size = convert(blender, glb, output, clips[0].motion.frame_rate)
+    lines = [*report.lines(), f"{output}: {size / 1e6:.2f} MB"]
+    return {"file": output.name, "bytes": size, **report.facts()}, lines, report.skipped
+
+
+def _write_meshes(
+    config: ExportConfig, avatar: Avatar, clips: list[Clip], options: CharacterOptions, output: Path, blender: list[str]
+) -> _Written:
+    """Write a mesh a frame."""
+    surface = character_surface(avatar, options)
+    with atomic_folder(output) as folder:
+        skipped = write_sequence(folder, surface, clips, config.format, weight_colors=config.weight_colors)
+    frames = sum(clip.motion.num_frames for clip in clips)
+    vertices, triangles = len(surface.mesh.vertices), len(surface.mesh.faces)
+    lines = [f"{frames - len(skipped)} frames of {vertices} vertices and {triangles} triangles each in {output}"]
+    return {"frames": frames, "vertices": vertices, "triangles": triangles, "skipped": skipped}, lines, tuple(skipped)

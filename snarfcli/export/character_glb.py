@@ -1,0 +1,202 @@
+"""A character as one `.glb` file: mesh, morph targets, skin, nodes and animations.
+
+Source: Khronos, glTF 2.0 specification, 3.7 (meshes, morph targets, skins) and 3.11 (animations).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snarfcli.export.character import Character, CharacterClip
+from snarfcli.export.glb import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbBuilder
+from snarfcli.export.meshes import weights_to_colors
+from snarfcli.export.rig import decompose, local_frames
+from snarfcli.meshing.mesh import vertex_normals
+
+__all__ = ["write_character"]
+
+# Linear, as glTF has it: a light clay on which shading shows; the weights' colours need white below them.
+_CLAY = (0.62, 0.50, 0.42, 1.0)
+_WHITE = (1.0, 1.0, 1.0, 1.0)
+_ROUGHNESS = 0.75
+_MOVES = {"translation": 1e-6, "rotation": 1e-7, "scale": 1e-6}
+"""Paths of a node's channels, and how far values may be from the node's own to be the same up to rounding (metres, 1, 1)."""
+
+
+def write_character(
+    path: str | Path,
+    character: Character,
+    joint_names: Sequence[str],
+    parents: Sequence[int],
+    *,
+    name: str = "avatar",
+    weight_colors: bool = False,
+    facts: dict[str, Any] | None = None,
+) -> int:
+    """Write a character, whole or not at all.
+
+    The nodes: one with the skinned mesh, one above all joints, and the joints, in the canonical pose. y is up, the root joint
+    carries the translation, units are metres. A mesh with morph targets names them in `extras.targetNames`.
+
+    Args:
+        path: the file.
+        character: what it holds.
+        joint_names: J names of nodes.
+        parents: J parents, -1 for a root.
+        name: of the mesh, and of the node above the joints.
+        weight_colors: whether vertices are coloured by their weights.
+        facts: for `asset.extras`.
+
+    Returns:
+        Its size in bytes.
+    """
+    builder = GlbBuilder(**(facts or {}))
+    roots = [2 + joint for joint, parent in enumerate(parents) if parent < 0]
+    mesh_node = builder.add("nodes", name=name, mesh=_add_mesh(builder, character, name, weight_colors), skin=0)
+    armature = builder.add("nodes", name=f"{name}_rig", children=roots)
+    first = len(builder.root["nodes"])
+    rest = decompose(local_frames(character.bind[None], parents))
+    for joint, joint_name in enumerate(joint_names):
+        children = [first + other for other, parent in enumerate(parents) if parent == joint]
+        scale = rest.scale[0, joint]
+        builder.add(
+            "nodes",
+            name=joint_name,
+            translation=_numbers(rest.translation[0, joint]),
+            rotation=_numbers(rest.rotation[0, joint]),
+            scale=_numbers(scale) if np.any(scale != 1) else None,
+            children=children or None,
+        )
+    builder.add("scenes", name=name, nodes=[mesh_node, armature])
+    builder.root["scene"] = 0
+    builder.add(
+        "skins",
+        name=name,
+        joints=list(range(first, first + len(parents))),
+        inverseBindMatrices=builder.array(np.linalg.inv(character.bind)),
+        skeleton=armature,
+    )
+    moving = {path: _moving(character.clips, path, getattr(rest, path)[0]) for path in _MOVES}
+    # A clip needs a channel, which also says how long it is.
+    moving["translation"][roots[0] - first] = moving["rotation"][roots[0] - first] = True
+    for clip in character.clips:
+        _add_clip(builder, clip, moving, first, mesh_node if len(character.shapes.targets) else None)
+    return builder.write(path)
+
+
+def _add_mesh(builder: GlbBuilder, character: Character, name: str, weight_colors: bool) -> int:
+    """Add the mesh with its attributes, morph targets and material; return its number."""
+    mesh = character.mesh
+    attributes = {
+        "POSITION": builder.array(mesh.vertices, target=ARRAY_BUFFER, bounds=True),
+        "NORMAL": builder.array(_units(mesh.normals), target=ARRAY_BUFFER),
+    }
+    if weight_colors:
+        colors = _linear(weights_to_colors(mesh.weights))
+        attributes["COLOR_0"] = builder.array(colors, "uint16", target=ARRAY_BUFFER, normalized=True)
+    joint_type = "uint8" if len(character.bind) <= 256 else "uint16"
+    for number, start in enumerate(range(0, character.joints.shape[1], 4)):
+        part = slice(start, start + 4)
+        attributes[f"JOINTS_{number}"] = builder.array(character.joints[:, part], joint_type, target=ARRAY_BUFFER)
+        attributes[f"WEIGHTS_{number}"] = builder.array(character.weights[:, part], target=ARRAY_BUFFER)
+    targets = []
+    for moved in character.shapes.targets:
+        bent = vertex_normals(mesh.vertices + moved, mesh.faces) - mesh.normals
+        targets.append(
+            {
+                "POSITION": builder.array(moved, target=ARRAY_BUFFER, bounds=True),
+                "NORMAL": builder.array(bent, target=ARRAY_BUFFER),
+            }
+        )
+    index_type = "uint16" if len(mesh.vertices) < 2**16 else "uint32"  # the largest number means something else
+    material = builder.add(
+        "materials",
+        name="weights" if weight_colors else "clay",
+        pbrMetallicRoughness={
+            "baseColorFactor": list(_WHITE if weight_colors else _CLAY),
+            "metallicFactor": 0.0,
+            "roughnessFactor": _ROUGHNESS,
+        },
+    )
+    primitive = {
+        "attributes": attributes,
+        "indices": builder.array(mesh.faces.ravel(), index_type, target=ELEMENT_ARRAY_BUFFER),
+        "material": material,
+        **({"targets": targets} if targets else {}),
+    }
+    return builder.add(
+        "meshes",
+        name=name,
+        primitives=[primitive],
+        weights=_numbers(character.shapes.rest) or None,
+        extras={"targetNames": [f"shape_{number}" for number in range(len(targets))]} if targets else None,
+    )
+
+
+def _add_clip(
+    builder: GlbBuilder, clip: CharacterClip, moving: dict[str, NDArray[np.bool_]], first: int, mesh_node: int | None
+) -> None:
+    """Add an animation; channels that stand still keep their first and last key."""
+    count = len(clip.joints.rotation)
+    times = np.arange(count) / clip.frame_rate
+    time_arrays: dict[int, int] = {}
+    samplers: list[dict[str, Any]] = []
+    channels: list[dict[str, Any]] = []
+
+    def add(node: int, path: str, values: NDArray) -> None:
+        values = np.asarray(values, dtype=np.float32)
+        keys = slice(None)
+        if count > 2 and (values == values[0]).all():
+            keys = slice(None, None, count - 1)
+        number = len(times[keys])
+        if number not in time_arrays:
+            time_arrays[number] = builder.array(times[keys], bounds=True)
+        flat = values[keys].reshape(-1) if path == "weights" else values[keys]
+        samplers.append({"input": time_arrays[number], "output": builder.array(flat), "interpolation": "LINEAR"})
+        channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
+
+    for path, which in moving.items():
+        for joint in np.flatnonzero(which):
+            add(first + int(joint), path, getattr(clip.joints, path)[:, joint])
+    if mesh_node is not None:
+        add(mesh_node, "weights", clip.shape_weights)
+    extras = {"frame_rate": clip.frame_rate, "frames": count}
+    builder.add("animations", name=clip.name, channels=channels, samplers=samplers, extras=extras)
+
+
+def _moving(clips: Sequence[CharacterClip], path: str, rest: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which joints [J] leave what their nodes say, in any clip: those need a channel in every one.
+
+    Else a program that goes from one clip to the next would keep what the one before left behind.
+    """
+    away = np.zeros(len(rest), dtype=bool)
+    for clip in clips:
+        values = getattr(clip.joints, path)
+        difference = np.abs(values - rest)
+        if path == "rotation":  # the other sign is the same turn
+            difference = np.minimum(difference.max(-1), np.abs(values + rest).max(-1))[..., None]
+        away |= (difference > _MOVES[path]).any(axis=(0, 2))
+    return away
+
+
+def _linear(colors: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return sRGB colours [V, 3] as linear ones with alpha, [V, 4] from 0 to 65535 (glTF 2.0, 3.7.2.1: linear)."""
+    share = colors / 255.0
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.rint(65535 * np.hstack([linear, np.ones((len(colors), 1))]))
+
+
+def _units(normals: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return normals of length 1 to the last bit of float32."""
+    normals = normals.astype(np.float64)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _numbers(values: NDArray[np.float64]) -> list[float]:
+    """Return numbers for JSON that float32 reads back as it rounds them."""
+    return [float(value) + 0.0 for value in values.astype(np.float32)]

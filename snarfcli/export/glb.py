@@ -1,0 +1,106 @@
+"""The container of a binary glTF 2.0 file: arrays in, bytes out. What they mean is the caller's business.
+
+Source: Khronos, glTF 2.0 specification, 3.6 (accessors and their alignment) and 4 (the binary container).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import snarfcli
+from snarfcli.files import atomic_path
+
+__all__ = ["ARRAY_BUFFER", "ELEMENT_ARRAY_BUFFER", "GlbBuilder"]
+
+ARRAY_BUFFER = 34962
+"""Target of a view with attributes of vertices."""
+ELEMENT_ARRAY_BUFFER = 34963
+"""Target of a view with corners of triangles."""
+
+_COMPONENTS = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+_KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
+_LARGEST = 2**32 - 1  # lengths are 32-bit numbers
+
+
+class GlbBuilder:
+    """Collects objects and arrays of one file.
+
+    `root` is the JSON as it will be written; its lists are made on first use by `add`.
+    """
+
+    def __init__(self, **facts: Any) -> None:
+        self.root: dict[str, Any] = {"asset": {"version": "2.0", "generator": f"snarf {snarfcli.__version__}"}}
+        if facts:
+            self.root["asset"]["extras"] = facts
+        self._binary = bytearray()
+
+    def add(self, collection: str, **item: Any) -> int:
+        """Append an object to a list of the root, such as `nodes`; return its number. What is None is left out."""
+        items = self.root.setdefault(collection, [])
+        items.append({name: value for name, value in item.items() if value is not None})
+        return len(items) - 1
+
+    def array(
+        self, values: np.ndarray, dtype: str = "float32", *, target: int | None = None, bounds: bool = False, **more: Any
+    ) -> int:
+        """Add an accessor with a view of its own and return its number.
+
+        Args:
+            values: [N] numbers, [N, 2..4] vectors, or [N, 4, 4] matrices, which glTF stores by columns.
+            dtype: uint8, uint16, uint32 or float32.
+            target: what a graphics card is to do with it, for what vertices and triangles are made of.
+            bounds: whether the smallest and largest values are written, as positions and times need.
+            more: further properties, such as `normalized`.
+
+        Raises:
+            ValueError: a row has another size than these, numbers are not finite, or rows are not aligned to 4 bytes.
+        """
+        values = np.asarray(values).astype(dtype)
+        if values.ndim == 3 and values.shape[1:] == (4, 4):
+            kind, rows = "MAT4", values.transpose(0, 2, 1).reshape(-1, 16)
+        elif values.ndim in (1, 2) and (1 if values.ndim == 1 else values.shape[1]) in _KINDS:
+            rows = values.reshape(len(values), -1)
+            kind = _KINDS[rows.shape[1]]
+        else:
+            raise ValueError(f"values: wanted shape [N], [N, 2 to 4] or [N, 4, 4], got {list(values.shape)}")
+        if not len(rows) or not np.isfinite(rows).all():
+            raise ValueError("values: wanted finite numbers and at least one row")
+        if target == ARRAY_BUFFER and rows.strides[0] % 4:
+            raise ValueError(f"values: rows of {rows.strides[0]} bytes are not aligned to 4")
+        self._binary.extend(b"\0" * (-len(self._binary) % 4))
+        content = np.ascontiguousarray(rows, rows.dtype.newbyteorder("<")).tobytes()
+        view = self.add("bufferViews", buffer=0, byteOffset=len(self._binary), byteLength=len(content), target=target)
+        self._binary.extend(content)
+        limits = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()} if bounds else {}
+        return self.add(
+            "accessors", bufferView=view, componentType=_COMPONENTS[dtype], count=len(rows), type=kind, **limits, **more
+        )
+
+    def to_bytes(self) -> bytes:
+        """Return the file.
+
+        Raises:
+            ValueError: it would be larger than the format allows.
+        """
+        binary = bytes(self._binary) + b"\0" * (-len(self._binary) % 4)
+        root = {**self.root, "buffers": [{"byteLength": len(binary)}]}
+        text = json.dumps(root, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        length = 12 + 8 + len(text) + 8 + len(binary)
+        if length > _LARGEST:
+            raise ValueError(f"{length / 2**30:.1f} GiB are more than a .glb file can hold")
+        head = struct.pack("<III", _MAGIC, 2, length) + struct.pack("<II", len(text), _JSON)
+        return head + text + struct.pack("<II", len(binary), _BINARY) + binary
+
+    def write(self, path: str | Path) -> int:
+        """Write the file, whole or not at all; return its size in bytes."""
+        content = self.to_bytes()
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(content)
+        return len(content)

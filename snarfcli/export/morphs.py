@@ -1,0 +1,94 @@
+"""The pose-dependent shape as few morph targets: principal components of the canonical surface's motion.
+
+Linear blend skinning turns and moves each vertex nearly rigidly, so an error of the canonical shape is the same error of the
+posed one: the components are found in the canonical frame, with every vertex and frame counting the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ShapeBasis", "fit_shapes", "spread_frames"]
+
+_INVISIBLE_M = 1e-5
+"""Components that move no vertex further than this in any frame that they are made from are left out, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeBasis:
+    """A shape, and what is added to it."""
+
+    base: NDArray[np.float32]
+    """[V, 3] shape of weights 0, metres."""
+    targets: NDArray[np.float32]
+    """[K, V, 3] what weight 1 adds, metres. Orthogonal to each other; the largest first."""
+    rest: NDArray[np.float32]
+    """[K] weights of the mean shape."""
+
+    def weights(self, shape: NDArray) -> NDArray[np.float32]:
+        """Return the weights [K] that come nearest to a shape [V, 3] (least squares)."""
+        moved = (shape - self.base).reshape(-1)
+        flat = self.targets.reshape(len(self.targets), moved.size)
+        return (flat @ moved) / np.einsum("kv,kv->k", flat, flat)
+
+    def shape(self, weights: NDArray) -> NDArray[np.float32]:
+        """Return the shape [V, 3] of weights [K]."""
+        return self.base + np.tensordot(weights.astype(np.float32), self.targets, 1)
+
+    def within_unit_range(self, weights: Sequence[NDArray[np.float32]]) -> tuple[ShapeBasis, list[NDArray[np.float32]]]:
+        """Return the same shapes from a base and targets for which all weights [T, K] are from 0 to 1, and these weights.
+
+        Programs show sliders from 0 to 1, and some cut off what is beyond: Blender's importer widens them for the first key
+        only.
+        Each component starts from that end of its range which is nearer to the mean; `rest` says where the mean is then.
+        """
+        if not len(self.targets):
+            return self, list(weights)
+        lowest = np.min([clip.min(axis=0) for clip in weights], axis=0)
+        highest = np.max([clip.max(axis=0) for clip in weights], axis=0)
+        starts_low = np.abs(lowest) <= np.abs(highest)
+        start = np.where(starts_low, lowest, highest)
+        span = np.where(starts_low, highest, lowest) - start
+        span = np.where(span == 0, 1, span).astype(np.float32)
+        changed = ShapeBasis(self.shape(start), self.targets * span[:, None, None], (self.rest - start) / span)
+        return changed, [((clip - start) / span).clip(0, 1) for clip in weights]
+
+
+def spread_frames(lengths: Sequence[int], most: int) -> list[tuple[int, int]]:
+    """Return pairs (clip, frame), at most `most` and spread evenly over clips of these many frames; at least one a clip."""
+    share = min(1.0, most / sum(lengths))
+    picked = []
+    for clip, length in enumerate(lengths):
+        count = max(1, min(length, int(length * share)))
+        picked += [(clip, int(frame)) for frame in np.linspace(0, length - 1, count).round()]
+    return picked
+
+
+def fit_shapes(shapes: NDArray[np.float32], count: int) -> ShapeBasis:
+    """Find the mean of shapes [S, V, 3] and at most `count` components of what differs from it.
+
+    The mean, not the canonical pose's shape, is what the others are nearest to; that shape is one more frame that nobody plays.
+    """
+    base = shapes.mean(axis=0, dtype=np.float64).astype(np.float32)
+    moved = (shapes - base).reshape(len(shapes), -1)
+    if not count or len(shapes) < 2:
+        return ShapeBasis(base, np.zeros((0, *base.shape), np.float32), np.zeros(0, np.float32))
+    # S is far smaller than 3 V: the components come from the S x S products, in float64 for the small ones.
+    products = np.zeros((len(shapes), len(shapes)))
+    for start in range(0, moved.shape[1], 2**16):
+        part = moved[:, start : start + 2**16].astype(np.float64)
+        products += part @ part.T
+    values, vectors = np.linalg.eigh(products)
+    order = np.argsort(-values)[:count]
+    order = order[values[order] > 1e-12 * max(values.max(), 1e-30)]
+    targets = vectors[:, order].T.astype(np.float32) @ moved
+    targets /= np.linalg.norm(targets, axis=1, keepdims=True).clip(1e-30)
+    played = np.abs(moved @ targets.T).max(axis=0)  # largest weights
+    targets = targets.reshape(len(order), *base.shape)
+    largest = played * np.linalg.norm(targets, axis=2).max(axis=1)
+    targets = targets[largest > _INVISIBLE_M]
+    return ShapeBasis(base, targets, np.zeros(len(targets), np.float32))

@@ -1,0 +1,168 @@
+"""The skeleton of an avatar as a rig of nodes: joint frames, local transforms, and few influences a vertex.
+
+A rig moves a vertex by sum_k w_k G_k(pose) inv(G_k(bind)), where G_k takes the frame of joint k to the world. The bind pose is
+the canonical one, and G_k(pose) = B_k G_k(bind) with the bone transform B_k, canonical to posed: so the rig is the avatar's own
+skinning (SNARF Eq. 4), for all weights exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from snarfcli.bodies import Skeleton
+from snarfcli.bodies.kinematics import nearest_rotation
+from snarfcli.motions import Motion
+
+__all__ = [
+    "Clip",
+    "LocalTransforms",
+    "bind_frames",
+    "clip_transforms",
+    "decompose",
+    "dense_weights",
+    "few_influences",
+    "local_frames",
+    "recompose",
+    "skin_vertices",
+    "unique_names",
+]
+
+_IS_RIGID = 1e-5
+"""How far a scale may be from 1, and axes from a right angle, to be taken for rounding of float32."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """A motion to be exported."""
+
+    motion: Motion
+    """Poses [T, J, 3], root translation [T, 3], name and frame rate."""
+    bone_transforms: NDArray | None = None
+    """[T, J, 4, 4] canonical to posed, metres, where joints stretch so that the poses do not say it all; else None."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalTransforms:
+    """Transforms of joints relative to their parents, as glTF's nodes have them: scaled first, then turned, then moved."""
+
+    translation: NDArray[np.float64]
+    """[T, J, 3] metres."""
+    rotation: NDArray[np.float64]
+    """[T, J, 4] unit quaternions x, y, z, w; from frame to frame the nearer of the two signs."""
+    scale: NDArray[np.float64]
+    """[T, J, 3]."""
+
+
+def bind_frames(skeleton: Skeleton) -> NDArray[np.float64]:
+    """Return where the joints are in the canonical pose, [J, 4, 4] from a joint's own frame to the canonical one, metres.
+
+    In the rest pose all axes are the world's.
+    """
+    skeleton = skeleton.to(dtype=torch.float64, device="cpu")
+    canonical_from_rest = skeleton.posed_from_rest(skeleton.canonical_pose[None])[0].numpy()
+    frames = canonical_from_rest.copy()
+    frames[:, :3, 3] = skeleton.canonical_joints.numpy()
+    return frames
+
+
+def clip_transforms(skeleton: Skeleton, clip: Clip) -> NDArray[np.float64]:
+    """Return the bone transforms [T, J, 4, 4] of a clip, canonical to posed, metres, in float64."""
+    if clip.bone_transforms is not None:
+        return np.asarray(clip.bone_transforms, dtype=np.float64)
+    skeleton = skeleton.to(dtype=torch.float64, device="cpu")
+    poses, translation = (torch.from_numpy(np.asarray(a, np.float64)) for a in (clip.motion.poses, clip.motion.translation))
+    return skeleton.posed_from_canonical(poses, translation).numpy()
+
+
+def local_frames(world_from_joint: NDArray[np.float64], parents: Sequence[int]) -> NDArray[np.float64]:
+    """Return frames [..., J, 4, 4] relative to the parents' frames; those of roots stay as they are."""
+    local = world_from_joint.copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            local[..., joint, :, :] = np.linalg.solve(world_from_joint[..., parent, :, :], world_from_joint[..., joint, :, :])
+    return local
+
+
+def decompose(local: NDArray[np.float64]) -> LocalTransforms:
+    """Take transforms [T, J, 4, 4] apart. Shear, which nodes cannot have, is left out; `recompose` shows what is left."""
+    linear = local[..., :3, :3]
+    rotation = nearest_rotation(torch.from_numpy(linear / _lengths(linear)[..., None, :])).numpy()
+    scale = np.einsum("...ab,...ab->...b", rotation, linear)
+    scale = np.where(np.abs(scale - 1) < _IS_RIGID, 1.0, scale)
+    quaternions = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat().reshape(*local.shape[:-2], 4)
+    # A quaternion and its negative are the same turn, but the way from one to the next must be the short one.
+    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=-1) < 0
+    signs = np.where(np.cumsum(flips, axis=0) % 2, -1.0, 1.0)
+    first = np.where(quaternions[:1, ..., 3:] < 0, -1.0, 1.0)
+    quaternions[1:] *= signs[..., None]
+    return LocalTransforms(local[..., :3, 3].copy(), quaternions * first, scale)
+
+
+def recompose(transforms: LocalTransforms, parents: Sequence[int]) -> NDArray[np.float64]:
+    """Return where the joints are, [T, J, 4, 4], as a reader of the nodes would find them."""
+    local = np.zeros((*transforms.rotation.shape[:-1], 4, 4))
+    turns = Rotation.from_quat(transforms.rotation.reshape(-1, 4)).as_matrix().reshape(*local.shape[:-2], 3, 3)
+    local[..., :3, :3] = turns * transforms.scale[..., None, :]
+    local[..., :3, 3] = transforms.translation
+    local[..., 3, 3] = 1
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            local[..., joint, :, :] = local[..., parent, :, :] @ local[..., joint, :, :]
+    return local
+
+
+def few_influences(weights: NDArray[np.float32], count: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Keep the largest weights of each vertex, so that they sum to 1 again.
+
+    Args:
+        weights: [V, J] non-negative, rows sum to 1.
+        count: how many to keep; columns of zeros are added where there are fewer joints.
+
+    Returns:
+        Joints [V, count], largest weight first, 0 where the weight is zero, and weights [V, count].
+    """
+    kept = min(count, weights.shape[1])
+    joints = np.argsort(-weights, axis=1, kind="stable")[:, :kept]
+    values = np.take_along_axis(weights.astype(np.float64), joints, axis=1).clip(0)
+    values = (values / values.sum(axis=1, keepdims=True)).astype(np.float32)
+    joints = np.where(values > 0, joints, 0)
+    return tuple(np.pad(array, ((0, 0), (0, count - kept))) for array in (joints, values))
+
+
+def dense_weights(joints: NDArray[np.int64], values: NDArray[np.float32], num_joints: int) -> NDArray[np.float64]:
+    """Return the weights [V, K] of joints [V, K] as weights of all joints [V, J]."""
+    dense = np.zeros((len(joints), num_joints))
+    for joint, value in zip(joints.T, values.T, strict=True):
+        dense[np.arange(len(joints)), joint] += value
+    return dense
+
+
+def skin_vertices(vertices: NDArray, transforms: NDArray[np.float64], weights: NDArray) -> NDArray[np.float64]:
+    """Move canonical vertices [V, 3] by bone transforms [J, 4, 4] and weights [V, J], in float64; metres."""
+    blended = (weights.astype(np.float64) @ transforms[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+    return np.einsum("vab,vb->va", blended[:, :, :3], vertices.astype(np.float64)) + blended[:, :, 3]
+
+
+def unique_names(names: Sequence[str]) -> list[str]:
+    """Return the names, those that come again with a number: walk, walk_2."""
+    found: list[str] = []
+    for name in names:
+        name = name or "clip"
+        copy, number = name, 1
+        while copy in found:
+            number += 1
+            copy = f"{name}_{number}"
+        found.append(copy)
+    return found
+
+
+def _lengths(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the lengths [..., 3] of columns, 1 where there is none."""
+    lengths = np.linalg.norm(linear, axis=-2)
+    return np.where(lengths > 1e-12, lengths, 1.0)

@@ -1,0 +1,94 @@
+"""Clips as folders of meshes, a file a frame: the avatar's skinned surface itself, with all weights and its own shape."""
+
+from __future__ import annotations
+
+import logging
+import re
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from snarfcli.errors import UserError
+from snarfcli.export.meshes import MESH_WRITERS, weights_to_colors
+from snarfcli.export.rig import Clip, unique_names
+from snarfcli.meshing.extract import EmptySurface, FullSurface
+from snarfcli.progress import progress
+
+if TYPE_CHECKING:
+    from snarfcli.meshing.skinned import SkinnedSurface
+
+__all__ = ["atomic_folder", "check_folder", "write_sequence"]
+
+log = logging.getLogger(__name__)
+
+_OURS = re.compile(r"frame_\d{6}\.(ply|obj)|export\.json")
+
+
+def check_folder(folder: Path, overwrite: bool) -> None:
+    """Refuse a folder that holds something, unless it may be replaced and holds nothing but frames.
+
+    Raises:
+        UserError: it must stay as it is.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder} is a file, not a folder; give output=FOLDER")
+    there = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
+    if there and not overwrite:
+        raise UserError(f"{folder} holds {there[0].name} already; give overwrite=true to replace it, or output=FOLDER")
+    foreign = [path for path in there if not _OURS.fullmatch(path.name)]
+    if foreign:
+        raise UserError(f"{folder} holds {foreign[0].name}, which is no frame of an export; give output=FOLDER")
+
+
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `folder` that takes its place when the block succeeds and vanishes when it fails."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.tmp")
+    temporary.mkdir()
+    try:
+        yield temporary
+        if folder.exists():
+            shutil.rmtree(folder)
+        temporary.replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def write_sequence(
+    folder: Path, surface: SkinnedSurface, clips: Sequence[Clip], suffix: str, *, weight_colors: bool = False
+) -> list[tuple[str, int, str]]:
+    """Write `frame_000000.ply` and so on into a folder, several clips into a folder each.
+
+    Args:
+        folder: where to; it is there.
+        surface: the skinned surface.
+        clips: motions, at least one.
+        suffix: ply or obj.
+        weight_colors: whether vertices are coloured by their weights.
+
+    Returns:
+        Clip, frame and reason of those that have no surface, whose number is left out.
+    """
+    skipped = []
+    colors = weights_to_colors(surface.mesh.weights) if weight_colors else None
+    for name, clip in zip(unique_names([clip.motion.name for clip in clips]), clips, strict=True):
+        place = folder / re.sub(r"[^\w.+-]+", "_", name).strip(".") if len(clips) > 1 else folder
+        place.mkdir(exist_ok=True)
+        motion = clip.motion
+        for frame in progress(range(motion.num_frames), desc=f"export {name}", unit="frames"):
+            pose, translation = (torch.from_numpy(part[frame]).float() for part in (motion.poses, motion.translation))
+            transforms = None if clip.bone_transforms is None else torch.as_tensor(clip.bone_transforms[frame]).float()
+            try:
+                mesh = surface.posed(pose, translation, transforms)
+            except (EmptySurface, FullSurface) as error:
+                skipped.append((name, frame, str(error)))
+                continue
+            MESH_WRITERS[suffix](place / f"frame_{frame:06d}.{suffix}", replace(mesh, colors=colors))
+    return skipped

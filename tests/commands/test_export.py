@@ -1,0 +1,247 @@
+"""`snarf export` end to end, on a chain of bones."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from glb_reader import GlbReader
+from toy_character import JOINTS, ToyCharacter, wave
+
+from snarfcli.cli import main
+from snarfcli.commands import choices
+from snarfcli.export import blender
+from snarfcli.export.exporting import ExportReport
+from snarfcli.meshing.extract import EmptySurface
+from snarfcli.meshing.skinned import SkinnedSurface
+
+SMALL = ("resolution=40", "triangles=400", "device=cpu")
+
+
+@pytest.fixture
+def toy(monkeypatch) -> ToyCharacter:
+    avatar = ToyCharacter()
+    monkeypatch.setattr(choices.Avatar, "load", classmethod(lambda cls, path, device: avatar))
+    return avatar
+
+
+@pytest.fixture
+def folder(tmp_path, toy, monkeypatch) -> Path:
+    """The run folder, in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "outputs" / "builtin" / "50002" / "fast_snarf"
+    run.mkdir(parents=True)
+    (run / "avatar.pt").write_bytes(b"the toy")
+    return run
+
+
+def pose_file(name: str, frames: int = 5, rate: float = 24.0) -> str:
+    motion = wave(frames)
+    np.savez(name, poses=motion.poses.reshape(frames, -1), trans=motion.translation, mocap_framerate=rate)
+    return name
+
+
+def export(capsys, *arguments: str) -> tuple[int, str]:
+    code = main(["export", *SMALL, "up=y", *arguments])
+    return code, capsys.readouterr().err
+
+
+def test_pose_files_become_clips(folder, capsys, caplog):
+    with caplog.at_level(logging.INFO):
+        walk, jump = pose_file("walk.npz"), pose_file("jump.npz", 7, 60.0)
+        code, err = export(capsys, "--pose", walk, f"--pose={jump}", "--pose", walk)
+    assert (code, err) == (0, "")
+    path = folder / "export" / "50002.glb"
+    assert sorted(file.name for file in path.parent.iterdir()) == ["50002.glb", "50002_glb.json"]
+    reader = GlbReader(path)
+    assert list(reader.clips) == ["walk", "jump", "walk_2"] and len(reader.faces()) <= 400
+    assert max(reader.array(sampler.input).max() for sampler in reader.clips["jump"].samplers) == pytest.approx(6 / 60)
+    record = json.loads((path.parent / "50002_glb.json").read_text())
+    assert record["bytes"] == path.stat().st_size and record["config"]["influences"] == 4
+    assert [(clip["name"], clip["frames"]) for clip in record["clips"]] == [("walk", 5), ("jump", 7), ("walk_2", 5)]
+    assert record["truncation_mm"] == reader.gltf.asset.extras["snarf"]["truncation_mm"]
+    text = " ".join(caplog.text.split())
+    for part in ("4 influences instead of 6", "morph targets explain", "walk_2 (5 frames, 0.17 s at 24)", "MB", "triangles; 6 j"):
+        assert part in text
+
+
+def test_frames_rate_and_place_are_chosen_as_for_animate(folder, capsys):
+    pose_file("walk.npz", 9)
+    code, err = export(
+        capsys, "--pose", "walk.npz", "start=1", "stop=6", "frame_rate=48", "in_place=true", "output=there/me.glb"
+    )
+    assert code == 0, err
+    reader = GlbReader(Path("there/me.glb"))
+    assert reader.gltf.animations[0].extras == {"frame_rate": 48, "frames": 9}
+    ways = np.stack([reader.values("walk", time)[reader.skin.joints[0], "translation"] for time in (0, 0.1)])
+    assert np.ptp(ways[:, [0, 2]], axis=0).max() < 1e-6 < np.ptp(ways[:, 1])
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj"])
+def test_a_mesh_a_frame(folder, toy, capsys, suffix):
+    arguments = ("--pose", pose_file("walk.npz", 4), f"format={suffix}", "weight_colors=true")
+    assert export(capsys, *arguments)[0] == 0
+    place = folder / "export" / f"50002_{suffix}"
+    names = [f"frame_{frame:06d}.{suffix}" for frame in range(4)]
+    assert sorted(path.name for path in place.iterdir()) == ["export.json", *names]
+    loaded = trimesh.load(place / names[2], process=False)
+    motion = wave(4)
+    surface = SkinnedSurface(toy, 40, mesh=toy.skinned_surface(40).mesh)
+    whole = surface.posed(*(torch.from_numpy(part[2]).float() for part in (motion.poses, motion.translation)))
+    assert len(loaded.faces) <= 400 < len(whole.faces) and loaded.is_watertight
+    np.testing.assert_allclose(loaded.bounds, whole.bounds, atol=3e-3)  # of decimated and whole mesh
+    assert np.ptp(loaded.visual.vertex_colors[:, :3], axis=0).max() > 50
+    code, err = export(capsys, *arguments)
+    assert code == 2 and "already; give overwrite=true" in err
+    assert export(capsys, *arguments, "overwrite=true", "max_frames=1")[0] == 0
+    assert sorted(path.name for path in place.iterdir()) == ["export.json", names[0]]
+    (place / "notes.txt").write_text("mine")
+    code, err = export(capsys, *arguments, "overwrite=true")
+    assert code == 2 and "holds notes.txt, which is no frame of an export" in err and (place / "notes.txt").exists()
+
+
+def test_several_clips_of_meshes_have_a_folder_each(folder, capsys):
+    pose_file("walk.npz", 2)
+    assert export(capsys, "--pose", "walk.npz", "--pose", "walk.npz", "format=ply", "output=out")[0] == 0
+    found = sorted(str(path.relative_to("out")) for path in Path("out").rglob("*.ply"))
+    assert found == [f"{clip}/frame_00000{frame}.ply" for clip in ("walk", "walk_2") for frame in range(2)]
+
+
+def test_an_existing_file_stays_until_overwrite(folder, capsys):
+    arguments = ("--pose", pose_file("walk.npz", 2))
+    path = folder / "export" / "50002.glb"
+    path.parent.mkdir()
+    path.write_bytes(b"mine")
+    (folder / "avatar.pt").unlink()  # refused before anything is looked at
+    code, err = export(capsys, *arguments)
+    assert code == 2 and err.endswith("50002.glb is there already; give overwrite=true to replace it, or output=FILE\n")
+    assert path.read_bytes() == b"mine"
+    (folder / "avatar.pt").write_bytes(b"the toy")
+    assert export(capsys, *arguments, "overwrite=true")[0] == 0 and path.read_bytes()[:4] == b"glTF"
+
+
+def test_a_crash_leaves_nothing(folder, capsys, monkeypatch):
+    def fail(self, *arguments):
+        raise OSError(28, "No space left on device", None)
+
+    pose_file("walk.npz", 3)
+    monkeypatch.setattr("snarfcli.export.glb.Path.write_bytes", fail)
+    code, err = export(capsys, "--pose", "walk.npz")
+    assert code == 2 and "the disk is full" in err
+    monkeypatch.undo()
+    monkeypatch.chdir(folder.parents[3])
+    monkeypatch.setattr(choices.Avatar, "load", classmethod(lambda cls, path, device: ToyCharacter()))
+    posed, calls = SkinnedSurface.posed, []
+
+    def crash(self, *arguments):
+        calls.append(0)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return posed(self, *arguments)
+
+    monkeypatch.setattr(SkinnedSurface, "posed", crash)
+    assert export(capsys, "--pose", "walk.npz", "format=ply")[0] == 130
+    assert not any(path.is_file() for path in folder.rglob("*") if path.name != "avatar.pt")
+
+
+def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
+    follow, calls = SkinnedSurface.canonical_vertices, []
+
+    def sometimes(self, pose):
+        calls.append(0)
+        if len(calls) == 2:
+            raise EmptySurface("the field is unoccupied")
+        return follow(self, pose)
+
+    monkeypatch.setattr(SkinnedSurface, "canonical_vertices", sometimes)
+    assert export(capsys, "--pose", pose_file("walk.npz", 4))[0] == 1
+    assert "clip walk, frame 1: the shape could not be followed: the field is unoccupied" in caplog.text
+    calls.clear()
+    assert export(capsys, "--pose", "walk.npz", "format=ply", "output=out")[0] == 1
+    assert sorted(path.name[-5] for path in Path("out").glob("*.ply")) == ["0", "2", "3"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["format=gltf"], "format must be glb or ply or obj or fbx or usd, got 'gltf'; did you mean"),
+        (["influences=3"], "influences must be 4 or 8, got 3"),
+        (["triangles=50"], "triangles must be between 100 and 5000000, got 50"),
+        (["triangles=99999999"], "triangles must be between"),
+        (["morph_targets=65"], "morph_targets must be between 0 and 64, got 65"),
+        (["step=0"], "step must be at least 1"),
+        (["output=me.fbx"], "output me.fbx should end in .glb; give format=fbx, or give another name"),
+        (["output=me"], "output me should end in .glb; give another name"),
+        (["output=."], "should end in .glb"),
+        (["--pose", "nowhere.npz"], "no pose file at nowhere.npz"),
+        (["--pose"], "--pose needs a value"),
+        (["motion=jumping_jacks"], "motion wants a list, got jumping_jacks; write motion=\\[jumping_jacks\\]"),
+        (["motion=[jumping_jacks]"], f"motion jumping_jacks is for SMPL's 24 joints, the avatar has {JOINTS}"),
+        (["motion=[jumping_jaks]"], "did you mean 'jumping_jacks'"),
+        (["subject=50004"], "no avatar in .*50004"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_a_user_can_get_wrong(folder, capsys, arguments, message):
+    import re
+
+    code, err = export(capsys, *arguments)
+    assert code == 2 and re.search(message, err) and len(err.splitlines()) == 1
+    assert not (folder / "export").exists()
+
+
+def test_an_avatar_without_weights_is_refused(folder, toy, capsys, monkeypatch):
+    monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
+    code, err = export(capsys, "--pose", pose_file("walk.npz"))
+    assert code == 2 and "export needs skinning weights of canonical points, which model toy does not have" in err
+    assert not (folder / "export").exists()
+
+
+# ---------------------------------------------------------------- through Blender
+@pytest.fixture
+def fake_blender(tmp_path, monkeypatch):
+    """Return what puts a program named blender on the path, alone."""
+    monkeypatch.setattr(blender.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+
+    def install(body: str) -> None:
+        (tmp_path / "bin").mkdir()
+        program = tmp_path / "bin" / "blender"
+        program.write_text(f"#!{sys.executable}\nimport sys\nglb, path, rate = sys.argv[sys.argv.index('--') + 1 :]\n{body}\n")
+        program.chmod(0o755)
+
+    return install
+
+
+def test_without_blender_one_line_says_how_to_get_it(folder, toy, capsys, fake_blender, monkeypatch):
+    monkeypatch.setattr(toy, "skinned_surface", None)  # nothing is made
+    code, err = export(capsys, "--pose", pose_file("walk.npz"), "format=fbx")
+    assert code == 2 and "fbx and usd are written by Blender, which is not here; pip install 'snarf[blender]'" in err
+
+
+def test_blender_gets_a_whole_glb(folder, capsys, fake_blender):
+    fake_blender("data = open(glb, 'rb').read(); open(path, 'wb').write(data[:4] + rate.encode()); print('snarf: written')")
+    assert export(capsys, "--pose", pose_file("walk.npz", 3), "format=fbx")[0] == 0
+    assert (folder / "export" / "50002.fbx").read_bytes() == b"glTF24.0"
+    assert sorted(path.name for path in (folder / "export").iterdir()) == ["50002.fbx", "50002_fbx.json"]
+    code, err = export(capsys, "--pose", "walk.npz", "--pose", "walk.npz", "format=usd")
+    assert code == 2 and "usd holds one timeline, got 2 motions" in err
+
+
+def test_a_crash_of_blender_leaves_nothing(folder, capsys, fake_blender):
+    fake_blender("open(path, 'wb').write(b'half'); print('about to'); sys.exit('Error: out of patience')")
+    code, err = export(capsys, "--pose", pose_file("walk.npz", 2), "format=fbx")
+    assert code == 2 and "Blender could not write 50002.fbx (Error: out of patience); give format=glb" in err
+    assert not any((folder / "export").iterdir())
+
+
+def test_the_report_says_what_a_clip_lasts():
+    numbers = {"max_mm": 0.0, "p99_mm": 0.0, "rms_mm": 0.0}
+    report = ExportReport(Path("a.glb"), 1, 1, 1, 1, 4, numbers, 0, numbers, numbers, numbers, ())
+    assert report.morph_share == 1 and "0 morph targets explain 100.0 %" in " ".join(report.lines())

@@ -23,7 +23,7 @@ BODY_COLOR = (205, 184, 168)
 _BONE, _JOINT, _CHOSEN = (70, 80, 95), (255, 214, 102), (235, 94, 40)  # sRGB
 _SEE_THROUGH = 0.45  # opacity of a body whose skeleton is to be seen inside of it
 _FIELD_OF_VIEW_RAD = 0.6
-_ROOM = 0.68  # half the height of the picture over the size of the body
+_ROOM = 0.78  # half the height of the picture over the size of the body
 
 
 class Scene:
@@ -52,7 +52,7 @@ class Scene:
         self._is_turning = False
         joints = posed_joints(self._skeleton, viewing.posed.transforms)
         self.size = float(max(np.ptp(joints, axis=0).max(), 0.1))
-        self._aside = float(np.ptp(joints[:, 0]) * 0.62 + 0.45 * self.size)
+        self._aside = float(1.15 * max(np.ptp(joints[:, 0]), 0.6 * self.size))
         server.scene.set_up_direction("+y")
         server.scene.configure_environment_map("studio", environment_intensity=0.2)
         self._floor = server.scene.add_grid(
@@ -86,8 +86,8 @@ class Scene:
             if key != self._shown:
                 self._shown = key
                 self._show_surfaces(picture)
-        self.advance()
-        self._show_skeleton(self._body.seen or picture.shown)
+            self.advance()
+            self._show_skeleton(self._body.seen or picture.shown)
 
     def advance(self) -> float | None:
         """Go on with what takes its time; return for how many seconds there is nothing to do, None for for ever."""
@@ -179,7 +179,7 @@ class Scene:
         """Return where a camera stands and looks at, metres: in front of the body, somewhat to its left."""
         joints = posed_joints(self._skeleton, self._viewing.posed.transforms)
         floor_y, half = self._viewing.floor_y, self.size / 2
-        middle = np.array([joints[:, 0].mean(), floor_y + 1.05 * half, joints[:, 2].mean()])
+        middle = np.array([joints[:, 0].mean(), floor_y + 1.12 * half, joints[:, 2].mean()])
         low, high = middle - half, middle + half
         if shows_canonical:
             low[0] -= self._aside

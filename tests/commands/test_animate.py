@@ -11,6 +11,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from toy_avatar import LENGTH, RADIUS, ToyAvatar
 
 from snarfcli.cli import main
@@ -149,6 +150,35 @@ def test_weight_colors_differ_between_the_bones(config, surface):
     assert not (folder_of(config) / "video.mp4").exists()
 
 
+def test_views_and_contents_side_by_side(config):
+    beside = ["canonical", "skinned", "weights"]
+    assert run(replace(config, max_frames=3, views=["front", "top"], beside=beside, video_size="48x40", turntable="90")) == 0
+    facts, frames = video_frames(folder_of(config) / "video.mp4")
+    poster = np.asarray(Image.open(folder_of(config) / "poster.png")).astype(int)
+    assert facts["size"] == (2 * 48 + 2, poster.shape[0] + poster.shape[0] % 2) and len(frames) == 3  # even, as codecs wish
+    assert np.abs(frames[1][: poster.shape[0], : poster.shape[1]] - poster).mean() < 6  # the middle of the video
+    strip = poster.shape[0] // 4 - 40
+    panels = [[poster[row * (40 + strip) :][:40, column * 49 :][:, :48] for column in range(2)] for row in range(4)]
+    for column in range(2):
+        assert np.abs(panels[0][column] - panels[2][column]).mean() < 3  # the same body in the same place
+    colors = [np.ptp(panel, axis=2).max() for panel, _ in panels]
+    assert colors[3] > colors[0] + 40  # only the weights are coloured
+    assert record_of(config)["poster"] == "poster.png"
+
+
+def test_truth_is_shown_where_there_is_some(config, toy, tmp_path, monkeypatch):
+    toy.facts = {"data": "meshes", "subject": "50002"}
+    with pytest.raises(UserError, match=r"beside=\[truth\]: there is no ground truth of pose files for data=meshes"):
+        run(replace(config, beside=["truth"]))
+    solid = trimesh.creation.box((0.4, 0.2, 0.2))
+    meshes = [(solid.vertices + (5 * frame, 1, 0), solid.faces) for frame in range(6)]
+    monkeypatch.setattr(animate, "true_meshes", lambda *arguments: meshes)
+    assert run(replace(config, beside=["truth"], max_frames=2, output=str(tmp_path / "out"))) == 0
+    _, frames = video_frames(tmp_path / "out" / "video.mp4")
+    truth = [frame[:64, 65:].astype(int) for frame in frames]
+    assert np.abs(truth[0] - truth[1]).mean() > 1  # it has left the picture
+
+
 def test_an_interrupted_run_goes_on(config, toy, monkeypatch, caplog):
     extract = animate.Animation._extract
 
@@ -253,6 +283,15 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"meshes": False, "video": False}, "nothing to make"),
         ({"video_size": "large"}, "video_size must be a number such as 512 or 1280x720"),
         ({"video_size": "9000"}, "video_size must be"),
+        ({"video_size": "2000", "views": ["front", "left", "back", "right", "top"]}, "5 panels .* smaller video_size"),
+        ({"views": ["frnt"]}, "got 'frnt'; did you mean 'front'"),
+        ({"views": []}, "views must be 1 to 8"),
+        ({"camera": "folow"}, "camera must be still or follow, got 'folow'; did you mean 'follow'"),
+        ({"turntable": "fast"}, "turntable must be true, false or degrees"),
+        ({"beside": ["thruth"]}, "beside must be canonical or truth .* got 'thruth'; did you mean 'truth'"),
+        ({"beside": ["field"]}, r"beside=\[field\]: the avatar is shown as surface=field already"),
+        ({"beside": ["weights", "weights"]}, "beside has 'weights' twice"),
+        ({"processes": "many"}, "processes must be auto or a number from 1 to 64, got 'many'"),
         ({"elevation_deg": 90.0}, "elevation_deg must be between"),
         ({"pose": None, "motion_frame_rate": 0.0}, "motion_frame_rate must be between"),
         ({"azimuth_deg": float("nan")}, "azimuth_deg must be between"),

@@ -7,6 +7,8 @@ import pytest
 import trimesh
 
 from snarfcli.export.camera import Camera
+from snarfcli.export.floor import Backdrop, Ground
+from snarfcli.export.lighting import Look, Solid
 from snarfcli.export.render import render
 from snarfcli.meshing.mesh import Mesh
 
@@ -94,3 +96,34 @@ def test_wrong_arguments_are_named():
         Camera.framing(np.zeros((0, 3)))
     with pytest.raises(ValueError, match="same point"):
         render(ball(), Camera((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 32)
+
+
+def test_what_was_prepared_draws_the_same_picture():
+    mesh, other = ball(), ball(center=(0.3, 0.6, 0.1))
+    camera = Camera.framing(mesh.vertices, margin=0.2)
+    backdrop = Backdrop(camera, (64, 48), Ground(-0.1), Look())
+    for shown in (mesh, other, None):
+        wanted = render(shown, camera, (64, 48), floor_y=-0.1)
+        np.testing.assert_array_equal(render(shown, camera, (64, 48), backdrop=backdrop), wanted)
+    np.testing.assert_array_equal(
+        render(Solid(mesh), camera, (64, 48), backdrop=backdrop), render(mesh, camera, (64, 48), floor_y=-0.1)
+    )
+    for size, floor_y in ((64, None), ((64, 48), 0.0)):
+        with pytest.raises(ValueError, match="backdrop: wanted one for this camera, size and look"):
+            render(mesh, camera, size, floor_y=floor_y, backdrop=backdrop)
+
+
+def test_lines_on_the_floor_are_faint_and_stay_where_they_are():
+    camera = Camera.framing(ball().vertices, elevation_rad=math.radians(60), margin=0.3)
+    plain, lined = (
+        render(None, camera, 160, backdrop=Backdrop(camera, (160, 160), Ground(0.0, spacing), Look())).astype(int)
+        for spacing in (None, 0.25)
+    )
+    darker = (plain - lined).mean(axis=2)
+    assert darker.min() >= 0 and 1 < darker.max() < 25
+    assert 0.01 < (darker > 1).mean() < 0.2
+    # a line lies under the world's own multiples of the spacing, whatever the camera looks at
+    for x in (0.25, -0.5):
+        column, row, _ = camera.project(np.array([[x, 0.0, 0.125]]), 160, 160)[0]
+        around = darker[int(row), int(column) - 1 : int(column) + 2]
+        assert around.max() > 1

@@ -1,0 +1,67 @@
+"""Frames on several processes: the same as on one, in order, and a clear end when a process is lost."""
+
+from __future__ import annotations
+
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moody_avatar import MoodyAvatar
+
+from snarfcli.errors import UserError
+from snarfcli.export.animation import Animation
+from snarfcli.export.panels import Screen
+from snarfcli.export.processes import choose_processes, parse_processes
+from snarfcli.export.stage import body_points, set_stage
+from snarfcli.export.views import parse_views
+
+BENDS = [0.0, 0.3, 0.5, 0.7, 0.9, 1.2]
+
+
+def animation(folder: Path) -> Animation:
+    avatar = MoodyAvatar()
+    poses, translation = np.zeros((len(BENDS), 2, 3)), np.zeros((len(BENDS), 3))
+    poses[:, 1, 2] = BENDS
+    stage = set_stage(body_points(avatar, poses, translation), poses, parse_views(["front", "top"]))
+    return Animation(
+        avatar, "bend", poses, translation, list(range(10, 16)), surface="field", resolution=24, folder=folder, suffix="ply",
+        screen=Screen(stage, (48, 40), {"avatar": "avatar"}),
+    )  # fmt: skip
+
+
+def test_several_processes_make_the_same_frames_and_a_lost_one_is_reported(tmp_path):
+    alone, together = animation(tmp_path / "alone"), animation(tmp_path / "together")
+    pictures = alone.pictures()
+    wanted = [next(pictures) for _ in range(5)]
+    made = together.pictures(processes=2)
+    for picture in wanted:
+        np.testing.assert_array_equal(next(made), picture)
+    assert [(frame.frame, frame.file, frame.vertices) for frame in together.frames] == [
+        (frame.frame, frame.file, frame.vertices) for frame in alone.frames
+    ]
+    assert [frame.problem is not None for frame in together.frames] == [False, False, True, False, False]
+    with pytest.raises(UserError, match=r"ended early \(exit code 9\); .*fewer workers, for example processes=1") as caught:
+        next(made)
+    assert "\n" not in str(caught.value)
+    assert not multiprocessing.active_children()
+    names = [f"frame_{index:06d}.ply" for index in (0, 1, 3, 4)]
+    assert sorted(path.name for path in (tmp_path / "together").iterdir()) == names
+    for name in names:
+        assert (tmp_path / "together" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+
+
+def test_what_processes_may_be():
+    import torch
+
+    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+    assert parse_processes("auto") is None and parse_processes("3") == 3
+    for text in ("0", "-1", "many", "65", "1.5"):
+        with pytest.raises(UserError, match="processes must be auto or a number from 1 to 64"):
+            parse_processes(text)
+    assert choose_processes(4, cpu, 100, 128) == 4 and choose_processes(4, cpu, 3, 128) == 3
+    assert choose_processes(None, gpu, 100, 128) == 1
+    with pytest.raises(UserError, match="processes=2 is for device=cpu"):
+        choose_processes(2, gpu, 100, 128)
+    assert choose_processes(None, cpu, 2, 128) == 1  # not worth a second process
+    assert choose_processes(None, cpu, 1000, 100_000) == 1  # no memory for it

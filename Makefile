@@ -52,6 +52,9 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_training.py
 	$(VENV)/bin/python benchmarks/bm_evaluation.py
 	$(VENV)/bin/python benchmarks/bm_extraction.py
+	$(VENV)/bin/python benchmarks/bm_shape.py
+	$(VENV)/bin/python benchmarks/bm_surfaces.py
+	$(VENV)/bin/python benchmarks/bm_video.py
 
 clean:
 	rm -rf .venv build data/processed outputs

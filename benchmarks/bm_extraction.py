@@ -1,15 +1,26 @@
-"""Seconds to extract the posed surface of one frame, field and skinned, at several resolutions.
+"""Seconds and memory to extract the posed surface of one frame, field and skinned, at several resolutions.
 
     python benchmarks/bm_extraction.py          needs `make demo`, or give --avatar
+
+For an avatar with the papers' networks:
+
+    snarf train subject=50002 run=paper_sized training=quick training.steps=1200 skinning=distilled shape=mlp \\
+        condition=global shape.prior_radius_m=0.07 shape.geometric_init=false shape.condition_at_start=false
 """
 
 from __future__ import annotations
 
+import os
+import threading
+import time
 from pathlib import Path
+from unittest import mock
 
 import torch
 from common import arguments, median_and_spread, print_machine, print_table, require, timed
 
+from snarfcli.meshing.extract import extract_surface
+from snarfcli.models import system
 from snarfcli.models.avatar import Avatar
 from snarfcli.motions import builtin_motion
 
@@ -19,22 +30,64 @@ def main() -> None:
         "Mesh extraction.",
         avatar={"default": "outputs/builtin/50002/demo/avatar.pt", "help": "a trained avatar"},
         resolutions={"type": int, "nargs": "+", "default": [128, 256], "help": "voxels along the longest side"},
+        memory={"action": "store_true", "help": "measure the memory of 512 voxels as well (Linux)"},
     )
     avatar = Avatar.load(require(Path(options.avatar), "make demo"))
+    shape = avatar.config.shape
     motion = builtin_motion("jumping_jacks", 0)
     pose = torch.as_tensor(motion.poses[60], dtype=torch.float32)
     print_machine()
-    rows = []
-    for surface in ("field", "skinned"):
-        for resolution in options.resolutions:
-            meshes = []
-            seconds = timed(
-                lambda s=surface, r=resolution, m=meshes: m.append(avatar.mesh(pose, resolution=r, surface=s)), options.repeats
-            )
-            mesh = meshes[-1]
-            points = f"{mesh.stats.points:,}" if mesh.stats else ""
-            rows.append([surface, resolution, median_and_spread(seconds), f"{len(mesh.vertices):,}", points])
-    print_table(["surface", "resolution", "ms a frame", "vertices", "points evaluated"], rows)
+    print(f"network: {shape.depth} layers of {shape.width}, {shape.activation}; condition: {avatar.config.condition.name}\n")
+    rows = [_row(avatar, pose, surface, r, options.repeats) for surface in ("field", "skinned") for r in options.resolutions]
+    with mock.patch.object(system, "can_evaluate", lambda *_: False):
+        rows += [_row(avatar, pose, "field", r, options.repeats, ", network in PyTorch") for r in options.resolutions]
+    print_table(["surface", "resolution", "first, ms", "then, ms a frame", "vertices", "points evaluated"], rows)
+    if options.memory:
+        print()
+        rows = [
+            ["field, 512", _peak_mib(lambda: avatar.mesh(pose, resolution=512))],
+            ["skinned, 512, the first", _peak_mib(lambda: avatar.mesh(pose, resolution=512, surface="skinned"))],
+            ["a ball in a cube, 512", _peak_mib(_ball)],
+        ]
+        print_table(["surface", "peak above the start, MiB"], rows)
+
+
+def _row(avatar: Avatar, pose: torch.Tensor, surface: str, resolution: int, repeats: int, how: str = "") -> list[str]:
+    meshes = []
+    avatar.to(avatar.device)  # forgets the canonical meshes
+    start = time.perf_counter()
+    avatar.mesh(pose, resolution=resolution, surface=surface)
+    first = 1000 * (time.perf_counter() - start)
+    seconds = timed(lambda: meshes.append(avatar.mesh(pose, resolution=resolution, surface=surface)), repeats)
+    mesh = meshes[-1]
+    points = f"{mesh.stats.points:,}" if surface == "field" else ""
+    return [surface + how, resolution, f"{first:.0f}", median_and_spread(seconds), f"{len(mesh.vertices):,}", points]
+
+
+def _ball() -> None:
+    extract_surface(lambda points: 0.45 - points.norm(dim=1), torch.full((3,), -0.5), torch.full((3,), 0.5), 512)
+
+
+def _peak_mib(work) -> str:
+    """Return how far the resident memory of the process rises above its start, looked at every 2 ms."""
+    page = os.sysconf("SC_PAGE_SIZE")
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * page
+
+    start = resident()
+    peak, done = [start], threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.002):
+            peak.append(max(peak[-1], resident()))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    work()
+    done.set()
+    watcher.join()
+    return f"{(peak[-1] - start) / 2**20:.0f}"
 
 
 if __name__ == "__main__":

@@ -36,6 +36,9 @@ _LARGEST_LOGIT = 10.0
 # Voxel of a skinned surface's canonical mesh and of the mesh that lends its weights, cells along the longest side.
 _WEIGHTS_RESOLUTION = 128
 _NEIGHBOURS = 8
+# Cells around the surface that are split beyond need. Bodies are of one piece: without any, 40 meshes of two avatars in ten poses
+# came out the same, from 12 % fewer evaluations.
+_DILATE = 0
 
 
 class AvatarLike(Protocol):
@@ -95,7 +98,7 @@ def field_surface(
         return limited(avatar.query(points[None], transforms[None], pose[None]).logits[0])
 
     mesh = extract_surface(
-        posed_logits, lower, upper, resolution, widen=True, keep_share=keep_share, chunk=chunk
+        posed_logits, lower, upper, resolution, dilate=_DILATE, widen=True, keep_share=keep_share, chunk=chunk
     ).with_normals()
     return mesh if weights_from is None else replace(mesh, weights=_borrow_weights(avatar, transforms, mesh, weights_from))
 
@@ -119,7 +122,9 @@ def canonical_surface(
     def canonical_logits(points_c: Tensor) -> Tensor:
         return limited(avatar.canonical_logits(points_c, pose))
 
-    mesh = extract_surface(canonical_logits, lower, upper, resolution, widen=True, keep_share=keep_share, chunk=chunk)
+    mesh = extract_surface(
+        canonical_logits, lower, upper, resolution, dilate=_DILATE, widen=True, keep_share=keep_share, chunk=chunk
+    )
     weights = in_chunks(avatar.skinning_weights, mesh.vertices)
     return replace(mesh, weights=weights).with_normals()
 

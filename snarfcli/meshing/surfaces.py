@@ -36,8 +36,8 @@ _LARGEST_LOGIT = 10.0
 # Voxel of a skinned surface's canonical mesh and of the mesh that lends its weights, cells along the longest side.
 _WEIGHTS_RESOLUTION = 128
 _NEIGHBOURS = 8
-# Cells around the surface that are split beyond need. Bodies are of one piece: without any, 40 meshes of two avatars in ten poses
-# came out the same, from 12 % fewer evaluations.
+# Cells around the surface that are split beyond need. Bodies are of one piece: without any, 40 meshes of two avatars came out
+# the same, from 12 % fewer evaluations.
 _DILATE = 0
 
 

@@ -168,15 +168,15 @@ def _processor() -> Iterator[Finding]:
 
 
 def _native() -> Finding:
-    """Return whether the native search runs, or why not."""
+    """Return whether the native library runs, or why not."""
     from snarfcli.deformer.library import build_note, instruction_set, library_path, why_unavailable
 
     reason = why_unavailable()
     if reason is not None:
-        return Finding("native search", f"not available, the reference in PyTorch is used: {reason}", is_fallback=True)
+        return Finding("native library", f"not available, the reference in PyTorch is used: {reason}", is_fallback=True)
     note = build_note() if "SNARF_NATIVE_LIBRARY" not in os.environ else {}
     built = f", built by {note['compiler']} for {', '.join(note['instruction_sets'])}" if note.get("built") else ""
-    return Finding("native search", f"active, {instruction_set()}, {library_path()}{built}")
+    return Finding("native library", f"active, {instruction_set()}, {library_path()}{built}")
 
 
 def _gpu() -> Iterator[Finding]:

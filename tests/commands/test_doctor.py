@@ -36,7 +36,7 @@ def test_everything_is_told(caplog, tmp_path):
     lines = report(caplog, tmp_path / "data", tmp_path / "outputs")
     assert lines["torch"] == torch.__version__
     assert lines["threads"].startswith(f"{torch.get_num_threads()} ")
-    assert lines["native search"].startswith(f"active, {library.instruction_set()}, {library.library_path()}")
+    assert lines["native library"].startswith(f"active, {library.instruction_set()}, {library.library_path()}")
     assert "no folder" in lines["data_root"] and "snarf preprocess" in lines["samples"] and "snarf train" in lines["avatars"]
     others = {"snarf", "python", "platform", "numpy", "model", "devices", "CUDA kernels", "ffmpeg", "embree", "libigl"}
     assert others <= set(lines)
@@ -53,8 +53,8 @@ def test_data_and_avatars_are_found(caplog, tmp_path):
 
 def test_a_fallback_is_named_with_its_reason(caplog, tmp_path, broken_library):
     lines = report(caplog, tmp_path, tmp_path)
-    assert lines["native search"].startswith("not available, the reference in PyTorch is used: SNARF_NATIVE_LIBRARY names")
-    assert "native search" in lines["end"]
+    assert lines["native library"].startswith("not available, the reference in PyTorch is used: SNARF_NATIVE_LIBRARY names")
+    assert "native library" in lines["end"]
 
 
 def test_many_names_are_cut():

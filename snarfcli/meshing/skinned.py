@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
 from snarfcli.meshing.surfaces import AvatarLike, canonical_surface, check_posed, in_chunks
 
@@ -29,6 +30,7 @@ _LEAST_SLOPE = 3.0  # logits a metre; what is flatter shows no surface to follow
 _LONGEST_STEP_M = 0.01
 _FARTHEST_M = 0.03  # that the pose may move a point of the canonical surface along its normal
 _FILLINGS = 20  # rounds in which lost points take the mean of their neighbours
+_MOST_LOST = 0.5  # share of lost points beyond which there is no surface to speak of
 
 
 class SkinnedSurface:
@@ -70,7 +72,11 @@ class SkinnedSurface:
 
     @torch.no_grad()
     def canonical_vertices(self, pose: Tensor) -> NDArray[np.float32]:
-        """Return the vertices [V, 3], canonical frame, metres, on the level set of the shape in `pose` [J, 3]."""
+        """Return the vertices [V, 3], canonical frame, metres, on the level set of the shape in `pose` [J, 3].
+
+        Raises:
+            EmptySurface: in this pose the shape has no surface near most of the vertices.
+        """
         way = self._control.ways(pose.float())
         if self._corners is not None:
             way = np.einsum("vc,vc->v", way[self._corners], self._shares)
@@ -84,6 +90,9 @@ class SkinnedSurface:
             pose: [J, 3] axis-angle, radians, global orientation included.
             translation: [3] metres.
             transforms: [J, 4, 4] canonical to posed, metres, instead of those of the pose; for joints that stretch.
+
+        Raises:
+            EmptySurface: in this pose the shape has no surface near most of the vertices.
         """
         pose, transforms = check_posed(self._avatar, pose, translation, transforms)
         vertices = _skin(self.canonical_vertices(pose), self.mesh.weights, transforms.cpu().numpy())
@@ -132,6 +141,9 @@ class _Followed:
 
     def _filled(self, way: NDArray[np.float32], lost: NDArray[np.int64]) -> NDArray[np.float32]:
         """Let points that found no level set, [L], go along with their neighbours."""
+        if len(lost) > _MOST_LOST * len(way):
+            share = 100 * len(lost) / len(way)
+            raise EmptySurface(f"the shape of this pose has no surface within {100 * _FARTHEST_M:g} cm of {share:.0f} % of the mesh")
         if len(lost):
             way[lost] = 0
             means = self.neighbours[lost]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from toy_avatar import LENGTH, RADIUS, ToyAvatar, capsule
 
+from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.skinned import SkinnedSurface
 
@@ -94,6 +95,17 @@ def test_where_the_shape_ends_vertices_go_along_with_their_neighbours():
     assert band.sum() > 20
     np.testing.assert_allclose(ways[~band], 0.01, atol=2e-4)
     np.testing.assert_allclose(ways[band], 0.01, atol=2e-3)
+
+
+def test_a_shape_that_vanishes_is_reported():
+    class Mortal(Breathing):
+        def canonical_logits(self, points_c: Tensor, pose: Tensor) -> Tensor:
+            return super().canonical_logits(points_c, pose) if pose[1, 0] < 0.5 else torch.full((len(points_c),), -30.0)
+
+    surface = SkinnedSurface(Mortal(), 40)
+    surface.posed(twisted(0.4))
+    with pytest.raises(EmptySurface, match="the shape of this pose has no surface within 3 cm of 100 % of the mesh"):
+        surface.posed(twisted(0.6))
 
 
 def test_bad_poses_are_refused():

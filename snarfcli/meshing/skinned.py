@@ -142,8 +142,8 @@ class _Followed:
     def _filled(self, way: NDArray[np.float32], lost: NDArray[np.int64]) -> NDArray[np.float32]:
         """Let points that found no level set, [L], go along with their neighbours."""
         if len(lost) > _MOST_LOST * len(way):
-            share = 100 * len(lost) / len(way)
-            raise EmptySurface(f"the shape of this pose has no surface within {100 * _FARTHEST_M:g} cm of {share:.0f} % of the mesh")
+            share = f"{100 * len(lost) / len(way):.0f} % of the mesh"
+            raise EmptySurface(f"the shape of this pose has no surface within {100 * _FARTHEST_M:g} cm of {share}")
         if len(lost):
             way[lost] = 0
             means = self.neighbours[lost]

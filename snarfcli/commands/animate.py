@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import re
 import time
@@ -16,6 +15,7 @@ import torch
 from omegaconf import MISSING
 
 from snarfcli.checks import check_choice, check_number
+from snarfcli.commands.animation_folder import POSTER, RECORD, VIDEO, folder_name, frame_settings, prepare_folder
 from snarfcli.commands.choices import (
     AvatarChoice,
     ChosenMotion,
@@ -34,7 +34,7 @@ from snarfcli.export.sheet import write_png
 from snarfcli.export.stage import CAMERAS, body_points, set_stage
 from snarfcli.export.video import write_video
 from snarfcli.export.views import View, parse_turntable, parse_views
-from snarfcli.files import read_json, write_json
+from snarfcli.files import write_json
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import SURFACES, canonical_surface
@@ -47,9 +47,6 @@ __all__ = ["AnimateConfig", "run"]
 
 log = logging.getLogger(__name__)
 
-_RECORD = "animation.json"
-_VIDEO = "video.mp4"
-_POSTER = "poster.png"
 _RESOLUTIONS = (16, 1024)  # dense lattices: 1024 take some 4 GB for a body with its arms spread
 _LARGEST_PICTURE = 4096
 
@@ -119,9 +116,9 @@ def run(config: AnimateConfig) -> int:
     motion, count = chosen.motion, len(chosen.numbers)
     truth = true_meshes(config, config, avatar, chosen, config.pose) if config.video and "truth" in config.beside else None
     processes = choose_processes(plan.processes, avatar.device, count, config.resolution)
-    folder = Path(config.output) if config.output else path.parent / "animation" / _file_name(motion.name)
-    settings = _settings(config, path, chosen)
-    _prepare(folder, settings, config.overwrite)
+    folder = Path(config.output) if config.output else path.parent / "animation" / folder_name(motion.name)
+    settings = frame_settings(config, path, chosen)
+    prepare_folder(folder, settings, config.overwrite)
     log.info("avatar: %s, on %s", path, avatar.device)
     log.info("motion: %s, %d frames at %g a second", motion.name, motion.num_frames, motion.frame_rate)
 
@@ -150,7 +147,7 @@ def run(config: AnimateConfig) -> int:
     pictures = animation.pictures(processes, threads)
     try:
         if config.video:
-            write_video(folder / _VIDEO, _with_poster(pictures, count // 2, folder / _POSTER), motion.frame_rate)
+            write_video(folder / VIDEO, _with_poster(pictures, count // 2, folder / POSTER), motion.frame_rate)
         else:
             for _ in pictures:
                 pass
@@ -159,7 +156,7 @@ def run(config: AnimateConfig) -> int:
         log.info("stopped after %d of %d frames; the same command goes on from there", done, count)
         raise
     record = _record(config, animation, motion, path, processes, time.perf_counter() - start)
-    write_json(folder / _RECORD, {"complete": True, "settings": settings, **record})
+    write_json(folder / RECORD, {"complete": True, "settings": settings, **record})
     return _report(config, animation, record["timings"])
 
 
@@ -248,57 +245,6 @@ def _check_system(config: AnimateConfig, avatar: Avatar) -> None:
         )
 
 
-def _file_name(name: str) -> str:
-    """Return a motion's name as a folder's."""
-    return re.sub(r"[^\w.+-]+", "_", name).strip(".") or "motion"
-
-
-def _settings(config: AnimateConfig, avatar: Path, chosen: ChosenMotion) -> dict[str, Any]:
-    """Return what the frames depend on: frames of other settings must not be mixed with them."""
-    # Of the frames, only which the first one is and how far they are apart: more of the same motion can be made later.
-    whole = chosen.whole
-    digest = hashlib.sha256(whole.poses.tobytes() + whole.translation.tobytes())
-    return {
-        "avatar_sha256": hashlib.sha256(avatar.read_bytes()).hexdigest(),
-        "motion_sha256": digest.hexdigest(),
-        "start": chosen.first,
-        "step": config.step,
-        "frame_rate": config.frame_rate,
-        "in_place": config.in_place,
-        "surface": config.surface,
-        "resolution": config.resolution,
-        "keep_share": config.keep_share,
-        "format": config.format,
-        "weight_colors": config.weight_colors,
-    }
-
-
-def _prepare(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
-    """Make the folder ready: keep frames of the same settings, refuse others, or start again."""
-    record = folder / _RECORD
-    old = None
-    if record.exists() and not overwrite:
-        content = read_json(record, "record of an animation")
-        old = content.get("settings") if isinstance(content, dict) else None
-        if not isinstance(old, dict):
-            raise UserError(f"{record} is no record of an animation; give overwrite=true to replace it, or output=FOLDER")
-    if old is not None:
-        changed = [name for name, value in settings.items() if old.get(name) != value]
-        if changed:
-            what = ", ".join(f"{name} {old.get(name)} (now {settings[name]})" for name in changed if "sha256" not in name)
-            what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
-            raise UserError(f"{folder} holds frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
-    else:
-        there = [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), *folder.glob(_VIDEO), *folder.glob(_POSTER)]
-        if there and not overwrite:  # without a record they are somebody else's
-            raise UserError(
-                f"{folder} holds {there[0].name} of unknown origin; give overwrite=true to replace it, or output=FOLDER"
-            )
-        for stale in there:
-            stale.unlink(missing_ok=True)
-    write_json(record, {"complete": False, "settings": settings})
-
-
 def _canonical(config: AnimateConfig, avatar: Avatar, motion: Motion) -> Mesh | None:
     """Return a canonical mesh of the body, for colours and cameras; None without need or if there is none."""
     if not (config.video or config.weight_colors) or not avatar.has_skinning_weights:
@@ -322,8 +268,8 @@ def _record(
         "config": asdict(config),
         "avatar": str(avatar),
         "motion": {"name": motion.name, "frames": motion.num_frames, "frame_rate": motion.frame_rate},
-        "video": _VIDEO if config.video else None,
-        "poster": _POSTER if config.video else None,
+        "video": VIDEO if config.video else None,
+        "poster": POSTER if config.video else None,
         "frames": [asdict(frame) for frame in frames],
         "skipped": [{"frame": frame.frame, "reason": frame.problem} for frame in frames if frame.problem],
         "timings": {
@@ -349,10 +295,10 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
     if config.meshes and skipped < len(frames):
         log.info("meshes: %s", folder / f"frame_*.{config.format}")
     if config.video:
-        log.info("video: %s, and its middle as %s", folder / _VIDEO, _POSTER)
+        log.info("video: %s, and its middle as %s", folder / VIDEO, POSTER)
     pieces = sum(frame.components > 1 for frame in frames)
     if pieces:
         log.info("%d frames have loose pieces; keep_share=0.1 would drop all but large ones", pieces)
     if skipped:
-        log.warning("%d of %d frames have no surface; see %s", skipped, len(frames), folder / _RECORD)
+        log.warning("%d of %d frames have no surface; see %s", skipped, len(frames), folder / RECORD)
     return 1 if skipped else 0

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -242,8 +243,12 @@ def _made_elsewhere(
             assert has_item
             yield item
     finally:
-        for worker in workers:
-            worker.end()
+        # All at once: each comes to its end only when it leaves native code.
+        endings = [threading.Thread(target=worker.end) for worker in workers]
+        for ending in endings:
+            ending.start()
+        for ending in endings:
+            ending.join()
 
 
 def _make_some(

@@ -197,11 +197,13 @@ def test_an_interrupted_run_goes_on(config, toy, monkeypatch, caplog):
     ]  # fmt: skip
     assert record_of(config)["complete"] is False
     before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.ply")}
+    (folder / ".frame_000003.1a2b3c4d.tmp.ply").write_bytes(b"half of a mesh, by a process that was killed")
 
     monkeypatch.setattr(animate.Animation, "_extract", extract)
     with caplog.at_level(logging.INFO):
         assert run(config) == 0
     assert "3 were there already" in caplog.text
+    assert not list(folder.glob(".*"))
     assert {name: (folder / name).stat().st_mtime_ns for name in before} == before
     assert len(video_frames(folder / "video.mp4")[1]) == 6
     assert record_of(config)["complete"] is True
@@ -334,7 +336,7 @@ def test_a_bvh_of_the_avatars_own_joints(config, tmp_path):
 def test_the_command_line(config, pose_file, capsys):
     arguments = [
         "animate", "--pose", str(pose_file), "up=y", f"output_root={config.output_root}", "resolution=24", "max_frames=2",
-        "video_size=64", "device=cpu",
+        "video_size=64", "device=cpu", "views=[45,back]", "turntable=true", "camera=follow", "beside=[skinned]", "processes=1",
     ]  # fmt: skip
     assert main(arguments) == 0
     assert len(video_frames(folder_of(config) / "video.mp4")[1]) == 2

@@ -15,6 +15,7 @@ from snarfcli.checks import check_number
 from snarfcli.errors import UserError
 from snarfcli.export.decimate import decimate
 from snarfcli.export.deviation import Deviation
+from snarfcli.export.influences import dense_weights, few_influences, trial_poses
 from snarfcli.export.morphs import ShapeBasis, fit_shapes, spread_frames
 from snarfcli.export.rig import (
     Clip,
@@ -22,8 +23,6 @@ from snarfcli.export.rig import (
     bind_frames,
     clip_transforms,
     decompose,
-    dense_weights,
-    few_influences,
     local_frames,
     recompose,
     skin_vertices,
@@ -47,6 +46,7 @@ MORPH_TARGETS = (0, 64)
 RESOLUTIONS = (16, 1024)
 # Poses that the components are found from: enough for the few that are kept, and as [S, V, 3] still small.
 _MOST_POSES = 150
+_MOST_RIG_POSES = 64  # that the weights of few joints are fitted to
 
 
 @dataclass(frozen=True)
@@ -162,12 +162,14 @@ def build_character(avatar: Avatar, surface: SkinnedSurface, clips: Sequence[Cli
     names = unique_names([clip.motion.name for clip in clips])
     transforms = [clip_transforms(avatar.skeleton, clip) for clip in clips]
     locals_ = [decompose(local_frames(moved @ bind, parents)) for moved in transforms]
-    joints, weights = few_influences(mesh.weights, options.influences)
+    lengths = [clip.motion.num_frames for clip in clips]
+    picked = np.stack([transforms[clip][frame] for clip, frame in spread_frames(lengths, _MOST_RIG_POSES)])
+    trials = trial_poses(avatar.skeleton, picked)
+    joints, weights = few_influences(mesh.weights, options.influences, mesh.vertices, *trials)
     few = dense_weights(joints, weights, len(parents))
     unbind = np.linalg.inv(bind)
 
     skipped: dict[tuple[int, int], str] = {}
-    lengths = [clip.motion.num_frames for clip in clips]
     spread = spread_frames(lengths, _MOST_POSES)
     known: dict[tuple[int, int], NDArray[np.float32]] = {}
     for clip, frame in progress(spread, desc="shapes", unit="poses"):

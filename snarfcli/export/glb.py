@@ -62,6 +62,8 @@ class GlbBuilder:
             ValueError: a row has another size than these, numbers are not finite, or rows are not aligned to 4 bytes.
         """
         values = np.asarray(values).astype(dtype)
+        if not values.size or not np.isfinite(values).all():
+            raise ValueError("values: wanted finite numbers and at least one row")
         if values.ndim == 3 and values.shape[1:] == (4, 4):
             kind, rows = "MAT4", values.transpose(0, 2, 1).reshape(-1, 16)
         elif values.ndim in (1, 2) and (1 if values.ndim == 1 else values.shape[1]) in _KINDS:
@@ -69,8 +71,6 @@ class GlbBuilder:
             kind = _KINDS[rows.shape[1]]
         else:
             raise ValueError(f"values: wanted shape [N], [N, 2 to 4] or [N, 4, 4], got {list(values.shape)}")
-        if not len(rows) or not np.isfinite(rows).all():
-            raise ValueError("values: wanted finite numbers and at least one row")
         if target == ARRAY_BUFFER and rows.strides[0] % 4:
             raise ValueError(f"values: rows of {rows.strides[0]} bytes are not aligned to 4")
         self._binary.extend(b"\0" * (-len(self._binary) % 4))

@@ -16,6 +16,7 @@ __all__ = ["ShapeBasis", "fit_shapes", "spread_frames"]
 
 _INVISIBLE_M = 1e-5
 """Components that move no vertex further than this in any frame that they are made from are left out, metres."""
+_ROUNDING = 1e-9  # of the largest component's variance: vertices are float32, of a metre, and the shape moves by centimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,7 @@ def fit_shapes(shapes: NDArray[np.float32], count: int) -> ShapeBasis:
         products += part @ part.T
     values, vectors = np.linalg.eigh(products)
     order = np.argsort(-values)[:count]
-    order = order[values[order] > 1e-12 * max(values.max(), 1e-30)]
+    order = order[values[order] > _ROUNDING * max(values.max(), 1e-30)]
     targets = vectors[:, order].T.astype(np.float32) @ moved
     targets /= np.linalg.norm(targets, axis=1, keepdims=True).clip(1e-30)
     played = np.abs(moved @ targets.T).max(axis=0)  # largest weights

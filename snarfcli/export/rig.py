@@ -1,4 +1,4 @@
-"""The skeleton of an avatar as a rig of nodes: joint frames, local transforms, and few influences a vertex.
+"""The skeleton of an avatar as a rig of nodes: joint frames, and their transforms relative to the parents'.
 
 A rig moves a vertex by sum_k w_k G_k(pose) inv(G_k(bind)), where G_k takes the frame of joint k to the world. The bind pose is
 the canonical one, and G_k(pose) = B_k G_k(bind) with the bone transform B_k, canonical to posed: so the rig is the avatar's own
@@ -25,8 +25,6 @@ __all__ = [
     "bind_frames",
     "clip_transforms",
     "decompose",
-    "dense_weights",
-    "few_influences",
     "local_frames",
     "recompose",
     "skin_vertices",
@@ -115,32 +113,6 @@ def recompose(transforms: LocalTransforms, parents: Sequence[int]) -> NDArray[np
         if parent >= 0:
             local[..., joint, :, :] = local[..., parent, :, :] @ local[..., joint, :, :]
     return local
-
-
-def few_influences(weights: NDArray[np.float32], count: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Keep the largest weights of each vertex, so that they sum to 1 again.
-
-    Args:
-        weights: [V, J] non-negative, rows sum to 1.
-        count: how many to keep; columns of zeros are added where there are fewer joints.
-
-    Returns:
-        Joints [V, count], largest weight first, 0 where the weight is zero, and weights [V, count].
-    """
-    kept = min(count, weights.shape[1])
-    joints = np.argsort(-weights, axis=1, kind="stable")[:, :kept]
-    values = np.take_along_axis(weights.astype(np.float64), joints, axis=1).clip(0)
-    values = (values / values.sum(axis=1, keepdims=True)).astype(np.float32)
-    joints = np.where(values > 0, joints, 0)
-    return tuple(np.pad(array, ((0, 0), (0, count - kept))) for array in (joints, values))
-
-
-def dense_weights(joints: NDArray[np.int64], values: NDArray[np.float32], num_joints: int) -> NDArray[np.float64]:
-    """Return the weights [V, K] of joints [V, K] as weights of all joints [V, J]."""
-    dense = np.zeros((len(joints), num_joints))
-    for joint, value in zip(joints.T, values.T, strict=True):
-        dense[np.arange(len(joints)), joint] += value
-    return dense
 
 
 def skin_vertices(vertices: NDArray, transforms: NDArray[np.float64], weights: NDArray) -> NDArray[np.float64]:

@@ -58,7 +58,7 @@ def allowed(report) -> float:
 def test_numpy_skinning_gives_the_skinned_surface(exported):
     path, report, surface, clips = exported
     reader = GlbReader(path)
-    assert report.truncation_mm["max_mm"] > 0.5  # a smooth skin over six bones is not that of four
+    assert report.truncation_mm["max_mm"] > 0.3  # a smooth skin over six bones is not that of four
     assert report.shape_motion_mm["max_mm"] > 300 * BULGE
     for clip in clips:
         for frame in FRAMES:

@@ -97,14 +97,15 @@ class Camera:
         return np.stack([width / 2 + focal * local[:, 0] / safe, height / 2 - focal * local[:, 1] / safe, depth], axis=1)
 
     def rays(self, x: np.ndarray, y: np.ndarray, width: int, height: int) -> np.ndarray:
-        """Return unit directions [N, 3] float32 through pixel coordinates x, y [N]."""
+        """Return unit directions [R * C, 3] float32, row by row, through pixel columns x [C] and rows y [R]."""
         focal = height / 2 / math.tan(self.fov_rad / 2)
-        right, up, backward = self.axes.astype(np.float32)
-        across = ((x - width / 2) / focal).astype(np.float32)[:, None]
-        upward = ((height / 2 - y) / focal).astype(np.float32)[:, None]
-        directions = across * right + upward * up - backward
-        directions /= np.sqrt(across**2 + upward**2 + 1)
-        return directions
+        right, up, backward = self.axes
+        across = ((x - width / 2) / focal)[:, None]
+        upward = ((height / 2 - y) / focal)[:, None]
+        directions = (across * right - backward).astype(np.float32) + (upward * up).astype(np.float32)[:, None]
+        length = np.sqrt((across.T**2 + 1).astype(np.float32) + (upward**2).astype(np.float32))
+        directions /= length[..., None]
+        return directions.reshape(-1, 3)
 
 
 def _right_up(backward: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -40,7 +40,7 @@ class Backdrop:
         self.camera, self.size, self.ground, self.look = camera, size, ground, look
         width, height = size
         x, y = np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5
-        view = camera.rays(np.tile(x, height), y.repeat(width), width, height)
+        view = camera.rays(x, y, width, height)
         position, target = (np.asarray(place, dtype=np.float32)[[0, 2]] for place in (camera.position, camera.target))
         above = np.float32(camera.position[1] - ground.height)
         meets = (view[:, 1] < -1e-4) & (above > 0)

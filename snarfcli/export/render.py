@@ -81,13 +81,12 @@ def _draw(scene: LitScene, width: int, height: int, supersample: int) -> tuple[n
     low, high = _screen_box(scene, width, height)
     columns = np.arange(low[0] * supersample, high[0] * supersample)
     rows = np.arange(low[1] * supersample, high[1] * supersample)
-    sample_x, sample_y = (grid.ravel() for grid in np.meshgrid(columns, rows))
-    if not sample_x.size:
+    if not (len(columns) and len(rows)):
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-    view = camera.rays((sample_x + 0.5) / supersample, (sample_y + 0.5) / supersample, width, height)
+    view = camera.rays((columns + 0.5) / supersample, (rows + 0.5) / supersample, width, height)
     hits = solid.first_hits(np.asarray(camera.position), view)
-    seen = hits["primID"] >= 0
-    sample_x, sample_y, view = sample_x[seen], sample_y[seen], view[seen]
+    seen = np.flatnonzero(hits["primID"] >= 0)
+    sample_x, sample_y, view = columns[seen % len(columns)], rows[seen // len(columns)], view[seen]
     corner = mesh.faces[hits["primID"][seen]]
     u, v = hits["u"][seen, None], hits["v"][seen, None]
     share = np.concatenate([1 - u - v, u, v], axis=1).astype(np.float32)
@@ -105,7 +104,9 @@ def _draw(scene: LitScene, width: int, height: int, supersample: int) -> tuple[n
     pixel_x, pixel_y = sample_x // supersample - low[0], sample_y // supersample - low[1]
     box = (high[1] - low[1], high[0] - low[0])
     flat = pixel_y * box[1] + pixel_x
-    first = np.unique(flat, return_index=True)[1]
+    first = np.full(box[0] * box[1], -1)
+    first[flat[::-1]] = np.arange(len(flat))[::-1]
+    first = first[first >= 0]
     phase = (pixel_y[first] % PATTERN) * PATTERN + pixel_x[first] % PATTERN
     light = np.zeros((box[0] * box[1], 4), dtype=np.float32)
     light[flat[first], :3], light[flat[first], 3] = scene.gather(points[first], normals[first], phase, floor=True)

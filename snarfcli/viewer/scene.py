@@ -158,16 +158,12 @@ class Scene:
         self._handle = self._server.scene.add_transform_controls(
             "/handle", scale=0.13 * self.size, disable_axes=True, disable_sliders=True, depth_test=False, visible=False
         )
-        self._handle.on_drag_start(lambda event: self._turning(True))
-        self._handle.on_drag_end(lambda event: self._turning(False))
-        self._handle.on_update(lambda event: self._turn_chosen())
+        self._handle.on_update(lambda event: self.turn_chosen(event.target.wxyz, event.phase == "end"))
 
-    def _turning(self, is_turning: bool) -> None:
-        self._is_turning = is_turning
-
-    def _turn_chosen(self) -> None:
-        """Turn the chosen joint as somebody turned the handle."""
-        turn = Rotation.from_quat(np.asarray(self._handle.wxyz)[[1, 2, 3, 0]])
+    def turn_chosen(self, wxyz: np.ndarray, is_over: bool) -> None:
+        """Turn the chosen joint as somebody turned the handle, a quaternion; the handle is theirs until that is over."""
+        self._is_turning = not is_over
+        turn = Rotation.from_quat(np.asarray(wxyz)[[1, 2, 3, 0]])
         vector = vector_from_turn(self._skeleton, self._viewing.posed.transforms, self.chosen_joint, turn)
         self._viewing.turn_joint(self.chosen_joint, vector)
 

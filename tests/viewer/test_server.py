@@ -1,0 +1,183 @@
+"""The page as its clients see it, over viser's own connection; no browser is needed."""
+
+from __future__ import annotations
+
+import socket
+import urllib.request
+
+import numpy as np
+import pytest
+from toy_avatar import ToyAvatar
+from toy_viewer import SMALL
+
+from snarfcli.errors import UserError
+from snarfcli.motions import Motion
+from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback
+
+pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
+
+from viser_page import Page  # noqa: E402
+
+FACTS = {"subject": "toy", "data": "none", "model": "capsules", "joints": "2"}
+
+
+def load_motion(name: str):
+    if name == "broken":
+        raise UserError("no such\nmotion")
+    poses = np.zeros((4, 2, 3))
+    poses[:, 1, 2] = np.linspace(0, 0.9, 4)
+    return Motion(name, poses, np.zeros((4, 3)), 20.0), None
+
+
+@pytest.fixture
+def server():
+    server = ViewServer(ToyAvatar(), SMALL, motions=["bend", "broken"], load_motion=load_motion, facts=FACTS)
+    yield server
+    server.stop()
+
+
+def test_the_page_is_served_on_this_machine_only_and_needs_no_other(server):
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/", timeout=60) as answer:
+        page = answer.read()
+    assert answer.status == 200 and b"<html" in page
+    assert b'src="http' not in page and b'href="http' not in page
+    assert server.server.get_host() == "127.0.0.1"
+
+
+def test_what_one_changes_all_see(server):
+    with Page(server.server) as one, Page(server.server) as other:
+        other.until_text("vertices")
+        other.expect()
+        one.change("turn z", 30.0)
+        other.until_node("/avatar/plain", "vertices")
+        assert server.viewing.posed.pose[1] == pytest.approx([0, 0, np.pi / 6])
+        other.expect()
+        one.change("turn y", 45.0, number=1)  # of the whole body
+        other.until_node("/avatar/plain", "vertices")
+        assert server.viewing.posed.pose[0] == pytest.approx([0, np.pi / 4, 0])
+        one.drop()
+        other.change("height", 0.5)
+        other.until_node("/avatar/plain", "vertices")
+        assert server.viewing.posed.translation[1] == 0.5
+        with Page(server.server) as late:
+            late.expect()
+            other.change("Reset pose", True)
+            late.until_node("/avatar/plain", "vertices")
+            assert not server.viewing.posed.pose.any()
+
+
+def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(server):
+    with Page(server.server) as page:
+        page.change("Motion", "bend")
+        page.until(lambda message: message.get("updates", {}).get("label") == "Pause")
+        page.until_node("/avatar/plain", "vertices")
+        frame = page.uuid("Frame")
+        page.until(lambda message: message.get("uuid") == frame and message["updates"].get("value", 0) > 0)
+        page.change("Pause", True)
+        page.until(lambda message: message.get("updates", {}).get("label") == "Play")
+        page.change("Frame", 0)
+        page.until(lambda message: message.get("uuid") == page.uuid("turn z"))
+        page.change("Frame", 3)
+        turn = page.uuid("turn z")
+        page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == pytest.approx(51.6))
+        assert server.viewing.posed.pose[1, 2] == pytest.approx(0.9)  # not that of the slider's whole tenths
+        page.change("Motion", "broken")
+        page.until_text("no such motion")
+        page.change("Motion", "none")
+        page.change("turn z", 10.0)
+        page.until_node("/avatar/plain", "vertices")
+
+
+def test_every_look(server):
+    with Page(server.server) as page:
+        page.until_text("vertices")
+        page.change("Weights in colour", True)
+        page.until(lambda message: message["type"] == "GlbMessage")
+        page.change("turn z", 20.0)
+        page.until(lambda message: message["type"] == "GlbMessage")  # the other one: they take turns
+        page.change("Canonical shape beside it", True)
+        page.until(lambda message: message["type"] == "GlbMessage" and message["name"].startswith("/canonical"))
+        page.change("Weights in colour", False)
+        page.until(lambda message: message.get("name") == "/canonical/plain")
+        page.change("Handle at the joint", True)
+        page.until(lambda message: message["type"] == "TransformControlsMessage")
+        page.change("Wireframe", True)
+        page.until_node("/avatar/plain", "wireframe")
+        page.change("Surface", "field")
+        page.until_text("made in")
+        page.change("Surface", "skinned")
+        page.until_text("skinned")
+
+
+def test_a_click_chooses_a_joint_and_the_handle_turns_it():
+    server = ViewServer(ToyAvatar(3), SMALL)
+    try:
+        with Page(server.server) as page:
+            page.change("Skeleton", True)
+            page.until(lambda message: message["type"] == "TransformControlsMessage")
+            server.controls.choose_joint(2)
+            assert server.controls.joint == server.scene.chosen_joint == 2
+            server.controls.choose_joint(0)  # the root has sliders of its own
+            assert server.controls.joint == 2
+            quarter = np.sqrt(0.5)
+            page.expect()
+            server.scene.turn_chosen(np.array([quarter, 0, 0, quarter]), is_over=True)
+            page.until_node("/avatar/plain", "vertices")
+            assert server.viewing.posed.pose[2] == pytest.approx([0, 0, np.pi / 2])
+    finally:
+        server.stop()
+
+
+def test_an_avatar_without_weights_has_no_choice_of_surface():
+    avatar = ToyAvatar()
+    avatar.has_skinning_weights = False
+    server = ViewServer(avatar, SMALL)
+    try:
+        with Page(server.server) as page:
+            page.until_text("made in")
+            inputs = [message["props"] for message in page.messages if "label" in message.get("props", {})]
+            shown = {props["label"]: props for props in inputs}
+            assert not shown["Weights in colour"]["visible"] and not shown["Canonical shape beside it"]["visible"]
+            assert shown["Surface"]["options"] == ["field"]
+    finally:
+        server.stop()
+
+
+def test_a_port_in_use_names_the_next_one(server):
+    with pytest.raises(UserError, match=rf"port {server.port} is in use; port \d+ is free: give --port"):
+        check_port("127.0.0.1", server.port)
+    with pytest.raises(UserError, match="is in use"):
+        ViewServer(ToyAvatar(), SMALL, port=server.port)
+    check_port("127.0.0.1", 0)
+    with pytest.raises(UserError, match="host 203.0.113.7 is no address of this machine"):  # RFC 5737: of no machine
+        check_port("203.0.113.7", 8080)
+
+
+def test_a_stopped_server_leaves_its_port():
+    server = ViewServer(ToyAvatar(), SMALL)
+    server.stop()
+    server.wait()
+    check_port("127.0.0.1", server.port)
+    with socket.socket() as client:
+        assert client.connect_ex(("127.0.0.1", server.port)) != 0
+
+
+@pytest.mark.parametrize(
+    ("environment", "platform", "can"),
+    [
+        ({"DISPLAY": ":0"}, "linux", True),
+        ({"WAYLAND_DISPLAY": "wayland-0"}, "linux", True),
+        ({}, "linux", False),
+        ({}, "darwin", True),
+        ({}, "win32", True),
+        ({"DISPLAY": "localhost:10.0", "SSH_CONNECTION": "1.2.3.4 5 6.7.8.9 22"}, "linux", False),
+        ({"SSH_TTY": "/dev/pts/0"}, "darwin", False),
+    ],
+)
+def test_a_browser_is_opened_only_where_it_is_seen(environment, platform, can):
+    assert can_open_browser(environment, platform) is can
+
+
+def test_loopback():
+    assert is_loopback("127.0.0.1") and is_loopback("localhost") and is_loopback("::1")
+    assert not is_loopback("0.0.0.0") and not is_loopback("192.168.0.2") and not is_loopback("example.org")

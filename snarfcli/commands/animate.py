@@ -94,8 +94,8 @@ class AnimateConfig(MotionChoice, AvatarChoice):
     overwrite: bool = MISSING
     """Start again, even over frames made with other settings."""
     processes: str = MISSING
-    """Processes that make frames at the same time, sharing the threads: auto (one a core as memory allows, 1 with a GPU) or a
-    number."""
+    """Processes that make frames at the same time, sharing the threads: auto (one a core as memory allows) or a number. With a
+    GPU one process extracts all surfaces, and they only draw."""
     experiment: str | None = None
     """Name of the preset of settings that the rest starts from; null for none."""
 
@@ -115,7 +115,8 @@ def run(config: AnimateConfig) -> int:
     chosen = choose_motion(config, config, avatar.skeleton, config.pose, config.motion)
     motion, count = chosen.motion, len(chosen.numbers)
     truth = true_meshes(config, config, avatar, chosen, config.pose) if config.video and "truth" in config.beside else None
-    processes = choose_processes(plan.processes, avatar.device, count, config.resolution)
+    on_cpu = avatar.device.type == "cpu"
+    processes = choose_processes(plan.processes, count, config.resolution, extract=on_cpu, draw=config.video)
     folder = Path(config.output) if config.output else path.parent / "animation" / folder_name(motion.name)
     settings = frame_settings(config, path, chosen)
     prepare_folder(folder, settings, config.overwrite)
@@ -143,8 +144,8 @@ def run(config: AnimateConfig) -> int:
     )
     threads = max(1, (config.threads or count_cores()) // processes)
     if processes > 1:
-        log.info("%d processes of %d threads", processes, threads)
-    pictures = animation.pictures(processes, threads)
+        log.info("%d processes %s", processes, f"of {threads} threads" if on_cpu else "draw")
+    pictures = animation.pictures(processes, threads, extracts_here=not on_cpu)
     try:
         if config.video:
             write_video(folder / VIDEO, _with_poster(pictures, count // 2, folder / POSTER), motion.frame_rate)

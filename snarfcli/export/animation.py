@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from snarfcli.export.lighting import Solid
+from snarfcli.export.drawers import Drawer
 from snarfcli.export.meshes import read_mesh, weights_to_colors, write_mesh
 from snarfcli.export.panels import Screen
 from snarfcli.meshing.extract import EmptySurface, FullSurface
@@ -106,7 +107,7 @@ class Animation:
     frames: list[FrameRecord] = field(default_factory=list)
     """What has been done so far."""
 
-    def pictures(self, processes: int = 1, threads: int = 1) -> Iterator[np.ndarray | None]:
+    def pictures(self, processes: int = 1, threads: int = 1, *, extracts_here: bool = False) -> Iterator[np.ndarray | None]:
         """Extract and write the mesh of each frame, and yield its picture, or None without a screen.
 
         Where there is no surface, the picture is that of the empty stage, so that the pace stays.
@@ -114,13 +115,16 @@ class Animation:
         Args:
             processes: how many make frames at the same time; 1 works in this one.
             threads: threads of tensor work in each of several.
+            extracts_here: whether this process extracts all meshes, since it has the GPU, and the others only draw.
 
         Raises:
             UserError: a process ended without a word, as when the system kills it for want of memory.
         """
         count = len(self.numbers)
-        if processes == 1:
+        if processes == 1 or (extracts_here and self.screen is None):
             made = (self.make(index) for index in range(count))
+        elif extracts_here:
+            made = _drawn_elsewhere(self, min(processes, count))
         else:
             made = _made_elsewhere(replace(self, frames=[]), min(processes, count), threads)
         with contextlib.closing(made):
@@ -135,6 +139,16 @@ class Animation:
 
     def make(self, index: int) -> tuple[FrameRecord, np.ndarray | None]:
         """Make one frame: its record, and its picture if there is a screen. The mesh is on disk then, if it is written."""
+        frame, shown = self.extract(index)
+        if self.screen is None:
+            return frame, None
+        start = time.perf_counter()
+        picture = self.screen.draw(index, shown)
+        frame.rendering_s = round(time.perf_counter() - start, 4)
+        return frame, picture
+
+    def extract(self, index: int) -> tuple[FrameRecord, dict[str, Mesh | None]]:
+        """Extract and write the mesh of one frame; return its record, and what the screen shows, None for no surface."""
         start = time.perf_counter()
         file = self.folder / f"frame_{index:06d}.{self.suffix}" if self.suffix else None
         frame = FrameRecord(frame=self.numbers[index], file=file.name if file else None)
@@ -147,18 +161,10 @@ class Animation:
             mesh = self._extract(index, frame)
             if file and mesh is not None:
                 write_mesh(file, mesh)
+        contents = self.screen.contents if self.screen else ()
+        shown = {name: mesh if name == "avatar" else self._beside(name, index, frame) for name in contents}
         frame.extraction_s = round(time.perf_counter() - start, 4)
-        if self.screen is None:
-            return frame, None
-        start = time.perf_counter()
-
-        def solid_of(content: str) -> Solid | None:
-            shown = mesh if content == "avatar" else self._beside(content, index, frame)
-            return Solid(shown) if shown is not None and len(shown.faces) else None
-
-        picture = self.screen.draw(index, solid_of)
-        frame.rendering_s = round(time.perf_counter() - start, 4)
-        return frame, picture
+        return frame, shown
 
     def _posed(self, index: int, surface: str, weights_from: Mesh | None = None) -> Mesh:
         return posed_mesh(
@@ -243,12 +249,44 @@ def _made_elsewhere(
             assert has_item
             yield item
     finally:
-        # All at once: each comes to its end only when it leaves native code.
-        endings = [threading.Thread(target=worker.end) for worker in workers]
-        for ending in endings:
-            ending.start()
-        for ending in endings:
-            ending.join()
+        _end_all(workers)
+
+
+def _drawn_elsewhere(animation: Animation, processes: int) -> Iterator[tuple[FrameRecord, np.ndarray | None]]:
+    """Extract all meshes here, draw them on several processes, and yield the frames in order; each process has one at most."""
+    assert animation.screen is not None
+    drawers: list[Drawer] = []
+    waiting: deque[tuple[FrameRecord, Drawer]] = deque()
+
+    def oldest() -> tuple[FrameRecord, np.ndarray]:
+        frame, drawer = waiting.popleft()
+        picture, seconds = drawer.take()
+        frame.rendering_s = round(seconds, 4)
+        return frame, picture
+
+    try:
+        for _ in range(processes):
+            with interrupts_held_back():
+                drawers.append(Drawer(animation.screen))
+        for index in range(len(animation.numbers)):
+            frame, shown = animation.extract(index)
+            if len(waiting) == processes:
+                yield oldest()
+            drawers[index % processes].begin(index, shown)
+            waiting.append((frame, drawers[index % processes]))
+        while waiting:
+            yield oldest()
+    finally:
+        _end_all(drawers)
+
+
+def _end_all(workers: Sequence[Worker | Drawer]) -> None:
+    """End processes all at once: each comes to its end only when it leaves native code."""
+    endings = [threading.Thread(target=worker.end) for worker in workers]
+    for ending in endings:
+        ending.start()
+    for ending in endings:
+        ending.join()
 
 
 def _make_some(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ from snarfcli.export.lighting import Look, Solid
 from snarfcli.export.render import render
 from snarfcli.export.sheet import text_strip
 from snarfcli.export.stage import Stage
+from snarfcli.meshing.mesh import Mesh
 
 __all__ = ["LARGEST_SIDE", "Screen", "picture_size"]
 
@@ -67,19 +68,20 @@ class Screen:
         """Leave out what was prepared: it is large and quickly made again."""
         return {**{name: value for name, value in vars(self).items() if name != "_strips"}, "_backdrops": {}}
 
-    def draw(self, frame: int, solid_of: Callable[[str], Solid | None]) -> np.ndarray:
+    def draw(self, frame: int, shown: Mapping[str, Mesh | None]) -> np.ndarray:
         """Draw one frame.
 
         Args:
             frame: which one.
-            solid_of: returns what to show as one of the contents; None leaves its stage empty.
+            shown: what to show as each of the contents; None leaves its stage empty.
 
         Returns:
             [H, W, 3] uint8, sRGB.
         """
         panels = []
         for content in self.contents:
-            solid = solid_of(content)
+            mesh = shown[content]
+            solid = Solid(mesh) if mesh is not None and len(mesh.faces) else None
             for view in range(len(self.stage.views)):
                 backdrop = self._backdrop(view, frame, content in self.settled)
                 panels.append(render(solid, backdrop.camera, self.size, look=_LOOK, backdrop=backdrop))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from snarfcli.errors import UserError
 from snarfcli.sampling.parallel import count_cores
 
@@ -32,26 +30,22 @@ def parse_processes(text: str) -> int | None:
     return int(word)
 
 
-def choose_processes(wanted: int | None, device: torch.device, frames: int, resolution: int) -> int:
+def choose_processes(wanted: int | None, frames: int, resolution: int, *, extract: bool = True, draw: bool = True) -> int:
     """Return how many processes make frames.
 
     Args:
-        wanted: what the user said; None to have it chosen: one with a GPU, else one a core, as memory and frames allow.
-        device: where the avatar computes.
+        wanted: what the user said; None to have it chosen: one a core, as memory and frames allow.
         frames: how many there are to make.
         resolution: cells along the longest side of the surface.
-
-    Raises:
-        UserError: several were asked for with a GPU.
+        extract: whether they extract surfaces; with a GPU only one process does.
+        draw: whether they draw pictures.
     """
-    if device.type != "cpu":
-        if wanted not in (None, 1):
-            raise UserError(f"processes={wanted} is for device=cpu; a GPU is kept busy by one, leave it out")
+    if not (extract or draw):
         return 1
     if wanted is not None:
         return min(wanted, frames)
-    room = _free_bytes() // (_BYTES_EACH + _BYTES_A_CELL * resolution**3 // 4)
-    return max(1, min(count_cores(), room, frames // _LEAST_FRAMES, _MOST))
+    each = _BYTES_EACH + (_BYTES_A_CELL * resolution**3 // 4 if extract else 0)
+    return max(1, min(count_cores(), _free_bytes() // each, frames // _LEAST_FRAMES, _MOST))
 
 
 def _free_bytes() -> int:

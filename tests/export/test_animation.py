@@ -11,6 +11,7 @@ from moody_avatar import MoodyAvatar
 
 from snarfcli.errors import UserError
 from snarfcli.export.animation import Animation
+from snarfcli.export.drawers import Drawer
 from snarfcli.export.panels import Screen
 from snarfcli.export.processes import choose_processes, parse_processes
 from snarfcli.export.stage import body_points, set_stage
@@ -51,17 +52,39 @@ def test_several_processes_make_the_same_frames_and_a_lost_one_is_reported(tmp_p
         assert (tmp_path / "together" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
 
 
-def test_what_processes_may_be():
-    import torch
+def test_surfaces_made_here_are_drawn_elsewhere(tmp_path):
+    alone, together = animation(tmp_path / "alone"), animation(tmp_path / "together")
+    pictures, made = alone.pictures(), together.pictures(processes=2, extracts_here=True)
+    for _ in range(3):  # the third has no surface
+        np.testing.assert_array_equal(next(made), next(pictures))
+    assert [frame.vertices for frame in together.frames] == [frame.vertices for frame in alone.frames]
+    assert all(frame.rendering_s > 0 for frame in together.frames)
+    made.close()
+    assert not multiprocessing.active_children()
 
-    cpu, gpu = torch.device("cpu"), torch.device("cuda")
+
+def test_a_drawer_that_is_lost_or_fails_is_reported(tmp_path):
+    screen = animation(tmp_path).screen
+    drawer = Drawer(screen)
+    drawer.begin(0, {})
+    with pytest.raises(RuntimeError, match="KeyError: 'avatar'"):
+        drawer.take()
+    drawer.begin(0, {"avatar": None})
+    picture, seconds = drawer.take()
+    np.testing.assert_array_equal(picture, screen.draw(0, {"avatar": None}))
+    drawer._process.kill()
+    with pytest.raises(UserError, match=r"a process that draws ended early \(exit code -9\)"):
+        drawer.take()
+    drawer.end()
+
+
+def test_what_processes_may_be():
     assert parse_processes("auto") is None and parse_processes("3") == 3
     for text in ("0", "-1", "many", "65", "1.5"):
         with pytest.raises(UserError, match="processes must be auto or a number from 1 to 64"):
             parse_processes(text)
-    assert choose_processes(4, cpu, 100, 128) == 4 and choose_processes(4, cpu, 3, 128) == 3
-    assert choose_processes(None, gpu, 100, 128) == 1
-    with pytest.raises(UserError, match="processes=2 is for device=cpu"):
-        choose_processes(2, gpu, 100, 128)
-    assert choose_processes(None, cpu, 2, 128) == 1  # not worth a second process
-    assert choose_processes(None, cpu, 1000, 100_000) == 1  # no memory for it
+    assert choose_processes(4, 100, 128) == 4 and choose_processes(4, 3, 128) == 3
+    assert choose_processes(None, 2, 128) == 1  # not worth a second process
+    assert choose_processes(None, 1000, 100_000) == 1  # no memory for it
+    assert choose_processes(4, 100, 128, extract=False) == 4
+    assert choose_processes(4, 100, 128, extract=False, draw=False) == 1

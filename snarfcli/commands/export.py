@@ -22,7 +22,7 @@ from snarfcli.commands.choices import (
 )
 from snarfcli.errors import UserError
 from snarfcli.export.blender import BLENDER_FORMATS, convert, find_blender
-from snarfcli.export.character import CharacterOptions, character_surface, check_options
+from snarfcli.export.character import CharacterOptions, character_surface, check_avatar, check_options
 from snarfcli.export.exporting import ExportReport, check_output, export_character
 from snarfcli.export.meshes import MESH_WRITERS
 from snarfcli.export.rig import Clip
@@ -85,6 +85,7 @@ def run(config: ExportConfig) -> int:
         trained_on = config.data.avatars or config.data.name
         _check_place(config, _place(config, run_folder(config.output_root, trained_on, config.subject, config.run)))
     avatar, path = load_chosen_avatar(config)
+    check_avatar(avatar)
     output = Path(config.output) if config.output else _place(config, path.parent)
     _check_place(config, output)
     clips = _clips(config, avatar)

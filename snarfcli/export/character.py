@@ -36,7 +36,15 @@ if TYPE_CHECKING:
     from snarfcli.meshing.skinned import SkinnedSurface
     from snarfcli.models.avatar import Avatar
 
-__all__ = ["Character", "CharacterClip", "CharacterOptions", "build_character", "character_surface", "check_options"]
+__all__ = [
+    "Character",
+    "CharacterClip",
+    "CharacterOptions",
+    "build_character",
+    "character_surface",
+    "check_avatar",
+    "check_options",
+]
 
 log = logging.getLogger(__name__)
 
@@ -120,6 +128,19 @@ def check_options(options: CharacterOptions) -> None:
     check_number("resolution", options.resolution, *RESOLUTIONS)
 
 
+def check_avatar(avatar: Avatar) -> None:
+    """Refuse an avatar that cannot be rigged.
+
+    Raises:
+        UserError: it has no skinning weights.
+    """
+    if not avatar.has_skinning_weights:
+        raise UserError(
+            f"a rig needs skinning weights of canonical points, which model {avatar.config.model.name} does not have; "
+            "take an avatar of model=fast_snarf, or write single meshes with \"snarf animate\""
+        )
+
+
 def character_surface(avatar: Avatar, options: CharacterOptions) -> SkinnedSurface:
     """Return the avatar's skinned surface with at most the triangles that are wanted.
 
@@ -129,11 +150,7 @@ def character_surface(avatar: Avatar, options: CharacterOptions) -> SkinnedSurfa
     """
     from snarfcli.meshing.skinned import SkinnedSurface
 
-    if not avatar.has_skinning_weights:
-        raise UserError(
-            f"export needs skinning weights of canonical points, which model {avatar.config.model.name} does not have; "
-            "take an avatar of model=fast_snarf, or write single meshes with \"snarf animate\""
-        )
+    check_avatar(avatar)
     surface = avatar.skinned_surface(options.resolution)
     if options.triangles is None or len(surface.mesh.faces) <= options.triangles:
         return surface

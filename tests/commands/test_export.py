@@ -199,7 +199,7 @@ def test_what_a_user_can_get_wrong(folder, capsys, arguments, message):
 def test_an_avatar_without_weights_is_refused(folder, toy, capsys, monkeypatch):
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
     code, err = export(capsys, "--pose", pose_file("walk.npz"))
-    assert code == 2 and "export needs skinning weights of canonical points, which model toy does not have" in err
+    assert code == 2 and "a rig needs skinning weights of canonical points, which model toy does not have" in err
     assert not (folder / "export").exists()
 
 

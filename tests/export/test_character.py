@@ -318,5 +318,5 @@ def test_without_weights_or_motions_there_is_no_character(toy, tmp_path, monkeyp
     with pytest.raises(UserError, match="no motion to export"):
         export_character(toy, tmp_path / "worm.glb", [], FEW)
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
-    with pytest.raises(UserError, match="export needs skinning weights of canonical points, which model toy does not have"):
+    with pytest.raises(UserError, match="a rig needs skinning weights of canonical points, which model toy does not have"):
         export_character(toy, tmp_path / "worm.glb", [Clip(wave(2))], FEW)

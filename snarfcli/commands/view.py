@@ -127,7 +127,8 @@ class _Shelf:
         self._loaded: dict[str, tuple[Any, Any]] = {}
         for path in config.pose:
             chosen = choose_motion(config, config, self._skeleton, path, None)
-            self._loaded[f"file: {Path(path).name}"] = chosen.motion, chosen.bone_transforms
+            name = f"file: {Path(path).name}"
+            self._loaded[f"file: {path}" if name in self._loaded else name] = chosen.motion, chosen.bone_transforms
         self.names: list[str] = [*self._loaded, *_own_motions(config, avatar)]
         first = next(iter(self._loaded), config.motion)
         self.first: tuple[str, Any, Any] | None = None if first is None else (first, *self.load(first))

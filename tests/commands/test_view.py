@@ -1,0 +1,198 @@
+"""`snarf view` from its settings to the page that it serves, on two capsules end to end."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from toy_avatar import ToyAvatar
+
+from snarfcli.cli import main
+from snarfcli.commands import view
+from snarfcli.commands.view import ViewConfig, run, start
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.errors import UserError
+from snarfcli.models.avatar import Avatar
+from snarfcli.viewer.server import ViewServer, check_port
+
+pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
+
+
+@pytest.fixture
+def toy(monkeypatch) -> ToyAvatar:
+    avatar = ToyAvatar()
+    avatar.config = SimpleNamespace(model=SimpleNamespace(name="capsules"), condition=SimpleNamespace(name="none"))
+    avatar.facts = {"subject": "50002", "data": "builtin", "steps": 7}
+    monkeypatch.setattr(Avatar, "load", classmethod(lambda cls, path, device: avatar))
+    return avatar
+
+
+@pytest.fixture(autouse=True)
+def opened(monkeypatch) -> list[str]:
+    """Addresses that a browser was opened with, on a machine with a display."""
+    addresses: list[str] = []
+    monkeypatch.setattr(view.webbrowser, "open", addresses.append)
+    monkeypatch.setattr(view, "can_open_browser", lambda: True)
+    return addresses
+
+
+@pytest.fixture
+def config(tmp_path: Path, toy: ToyAvatar, monkeypatch) -> ViewConfig:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "outputs" / "builtin" / "50002" / "fast_snarf"
+    folder.mkdir(parents=True)
+    (folder / "avatar.pt").write_bytes(b"the toy")
+    return ViewConfig(
+        subject="50002",
+        data=DataConfig("builtin", 8, 1, 1),
+        data_root="data",
+        output_root="outputs",
+        run="fast_snarf",
+        ckpt=None,
+        device="cpu",
+        threads=None,
+        up="y",
+        hands="rest",
+        mapping=None,
+        clip=None,
+        motion_seed=0,
+        motion_frame_rate=30.0,
+        start=0,
+        stop=None,
+        step=1,
+        frame_rate=None,
+        max_frames=None,
+        in_place=False,
+        pose=[],
+        motion=None,
+        surface="skinned",
+        resolution=24,
+        weight_colors=False,
+        host="127.0.0.1",
+        port="auto",
+        open=True,
+    )
+
+
+@pytest.fixture
+def served(config):
+    """Starts a viewer with changed settings, and stops it in the end."""
+    servers: list[ViewServer] = []
+
+    def serve(**changes) -> ViewServer:
+        servers.append(start(replace(config, **changes)))
+        return servers[-1]
+
+    yield serve
+    for server in servers:
+        server.stop()
+
+
+def pose_file(name: str, frames: int = 3) -> str:
+    poses = np.zeros((frames, 6))
+    poses[:, 5] = np.linspace(0, 0.9, frames)
+    Path(name).parent.mkdir(exist_ok=True)
+    np.savez(name, poses=poses, trans=np.zeros((frames, 3)), mocap_framerate=24.0)
+    return name
+
+
+def test_the_page_is_served_and_opened(served, opened, caplog):
+    with caplog.at_level(logging.INFO):
+        server = served()
+    address = f"http://127.0.0.1:{server.port}"
+    assert opened == [address] and f"page: {address} (Ctrl-C ends it)" in caplog.text
+    assert "ssh -L" not in caplog.text and "anybody" not in caplog.text
+    with urllib.request.urlopen(address, timeout=60) as answer:
+        assert answer.status == 200
+    assert server.viewing.motion is None and server.viewing.look.skinned_resolution == 24
+
+
+def test_without_a_display_the_way_from_elsewhere_is_told(served, opened, monkeypatch, caplog):
+    monkeypatch.setattr(view, "can_open_browser", lambda: False)
+    with caplog.at_level(logging.INFO):
+        server = served()
+    assert not opened and f"ssh -L {server.port}:127.0.0.1:{server.port} " in caplog.text
+
+
+def test_no_browser_if_not_wanted(served, opened):
+    served(open=False)
+    assert not opened
+
+
+def test_who_listens_to_all_is_warned(served, opened, caplog):
+    with caplog.at_level(logging.WARNING):
+        server = served(host="0.0.0.0")
+    assert [record.message for record in caplog.records] == [
+        "host=0.0.0.0: anybody who reaches this machine over the network can see and change the page"
+    ]
+    assert opened == [f"http://127.0.0.1:{server.port}"]
+
+
+def test_pose_files_are_on_the_shelf_and_the_first_one_plays(served):
+    files = [pose_file("wave.npz"), pose_file("bend.npz", 5), pose_file("other/wave.npz", 4)]
+    server = served(pose=files)
+    assert server.viewing.player.is_playing and server.viewing.motion.num_frames == 3
+    assert server.controls._motion.options == ("none", "file: wave.npz", "file: bend.npz", "file: other/wave.npz")
+    assert server.controls._motion.value == "file: wave.npz"
+    server.controls._choose_motion("file: other/wave.npz", None)
+    assert server.viewing.motion.num_frames == 4
+
+
+def test_sequences_of_the_samples_are_on_the_shelf(served, config, toy, monkeypatch):
+    skeleton = SimpleNamespace(names=toy.skeleton.names, parents=toy.skeleton.parents)
+    store = SimpleNamespace(skeleton=skeleton, all_sequences=[SimpleNamespace(name="trot"), SimpleNamespace(name="sit")])
+    monkeypatch.setattr(view.SampleStore, "open", staticmethod(lambda *arguments: store))
+    server = served(data=DataConfig("meshes", 1, 1, 1), ckpt="outputs/builtin/50002/fast_snarf")
+    assert server.controls._motion.options == ("none", "trot", "sit")
+    store.skeleton = SimpleNamespace(names=("a", "b"), parents=(-1, 0))
+    server = served(data=DataConfig("meshes", 1, 1, 1), ckpt="outputs/builtin/50002/fast_snarf")
+    assert server.controls._motion.options == ("none",)
+
+
+def test_ctrl_c_stops_the_server(config, monkeypatch, capsys):
+    ports: list[int] = []
+
+    def interrupted(server: ViewServer) -> None:
+        ports.append(server.port)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ViewServer, "wait", interrupted)
+    assert main(["view", "--port", "auto", "--no-open", "--pose", pose_file("wave.npz"), "up=y", "resolution=24"]) == 130
+    assert "snarf view: interrupted" in capsys.readouterr().err
+    check_port("127.0.0.1", ports[0])
+    monkeypatch.setattr(ViewServer, "wait", lambda server: None)
+    assert run(config) == 0
+
+
+def test_without_viser_one_line_before_any_work(config, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", "ckpt=nowhere.pt"]) == 2
+    err = capsys.readouterr().err
+    assert "pip install 'snarf[view]'" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"port": "http"}, "port must be a number from 1 to 65535, or auto for any free one, got 'http'"),
+        ({"port": "65536"}, "port must be a number"),
+        ({"port": "-1"}, "port must be a number"),
+        ({"host": "203.0.113.7"}, "host 203.0.113.7 is no address of this machine"),
+        ({"surface": "feild"}, "surface must be skinned or field, got 'feild'; did you mean 'field'"),
+        ({"resolution": 15}, "resolution must be between 16 and 1024, got 15"),
+        ({"step": 0}, "step must be at least 1"),
+        ({"pose": ["nowhere.npz"]}, "no pose file at nowhere.npz"),
+        ({"motion": "jumping_jacks"}, "motion jumping_jacks is for SMPL's 24 joints"),
+        ({"subject": "50004"}, 'no avatar in .*50004.*; run "snarf train subject=50004" or give ckpt=PATH'),
+    ],
+    ids=lambda value: ",".join(value) if isinstance(value, dict) else "",
+)
+def test_what_a_user_can_get_wrong(config, change, message):
+    with pytest.raises(UserError, match=message):
+        start(replace(config, **change))

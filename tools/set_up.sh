@@ -28,8 +28,10 @@ $pip install --quiet --editable '.[test]'
 readers=build/readers
 if command -v npm >/dev/null 2>&1 && ! cmp -s tests/readers/package.json $readers/package.json; then
     mkdir -p $readers.new && cp tests/readers/package.json $readers.new/ &&
-        npm install --prefix $readers.new --no-audit --no-fund --silent --fetch-retries=1 --fetch-timeout=30000 &&
-        rm -rf $readers && mv $readers.new $readers ||
+        npm install --prefix $readers.new --ignore-scripts --no-audit --no-fund --silent --fetch-retries=1 --fetch-timeout=30000 &&
+        rm -rf $readers && mv $readers.new $readers || {
+        rm -rf $readers.new
         echo "three.js and the Khronos validator could not be installed into $readers; their tests are skipped" >&2
+    }
 fi
 touch "$venv/.snarf-installed"

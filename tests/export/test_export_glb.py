@@ -1,0 +1,55 @@
+"""`Avatar.export_glb` on an untrained avatar with networks, against `Avatar.mesh`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from glb_reader import GlbReader
+from toy_character import FRAME_RATE, ToyCharacter, stretched, wave
+from toy_training import avatar_config
+
+from snarfcli.deformer import CanonicalGrid
+from snarfcli.errors import UserError
+from snarfcli.models.avatar import Avatar
+
+SMALL = {"triangles": None, "resolution": 32}
+
+
+@pytest.fixture(scope="module")
+def avatar() -> Avatar:
+    torch.manual_seed(0)
+    skeleton, config = ToyCharacter().skeleton, avatar_config(capsules=True)
+    surface = torch.cat([skeleton.canonical_joints + shift for shift in (torch.zeros(3), torch.tensor([0.2, 0.06, 0.0]))])
+    grid = CanonicalGrid.around(surface, [0.15, 0.15, 0.15])
+    avatar = Avatar(config, skeleton, grid, surface, {"data": "builtin", "subject": "toy"}).to("cpu")
+    avatar.model.eval()
+    return avatar
+
+
+def test_the_file_shows_what_mesh_returns(avatar, tmp_path):
+    motions = [wave(4), wave(3, "back", -0.6)]
+    report = avatar.export_glb(tmp_path / "toy.glb", motions, **SMALL)
+    reader = GlbReader(tmp_path / "toy.glb")
+    assert report.num_bytes == (tmp_path / "toy.glb").stat().st_size and reader.mesh.name == "toy"
+    assert [clip.name for clip in report.clips] == ["wave", "back"]
+    for motion in motions:
+        for frame in range(motion.num_frames):
+            pose, translation = (torch.from_numpy(part[frame]).float() for part in (motion.poses, motion.translation))
+            wanted = avatar.mesh(pose, translation, resolution=32, surface="skinned").vertices
+            error = np.linalg.norm(reader.vertices(motion.name, frame / FRAME_RATE) - wanted, axis=1).max()
+            assert error < 5e-4 + 1e-3 * report.truncation_mm["max_mm"]
+
+
+def test_one_motion_or_clip_will_do(avatar, tmp_path):
+    few = {"resolution": 32, "triangles": 300, "morph_targets": 0, "influences": 8, "weight_colors": True}
+    report = avatar.export_glb(tmp_path / "a.glb", wave(2), **few)
+    assert report.triangles <= 300 and report.influences == 8 and report.morph_targets == 0
+    again = avatar.export_glb(tmp_path / "b.glb", stretched(wave(2), ToyCharacter()), **few)
+    assert again.clips[0].frames == 2
+    with pytest.raises(UserError, match="a.glb is there already"):
+        avatar.export_glb(tmp_path / "a.glb", wave(2), **few)
+    with pytest.raises(ValueError, match="influences must be 4 or 8, got 5"):
+        avatar.export_glb(tmp_path / "c.glb", wave(2), influences=5)
+    with pytest.raises(ValueError, match="no motion to export"):
+        avatar.export_glb(tmp_path / "c.glb", [])

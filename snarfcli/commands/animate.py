@@ -26,7 +26,7 @@ from snarfcli.commands.choices import (
 )
 from snarfcli.commands.truth import true_meshes
 from snarfcli.errors import UserError
-from snarfcli.export.animation import CONTENTS, Animation, place_canonical
+from snarfcli.export.animation import CONTENTS, Animation, Meshes, place_canonical
 from snarfcli.export.meshes import MESH_WRITERS
 from snarfcli.export.panels import Screen, picture_size
 from snarfcli.export.processes import choose_processes, parse_processes
@@ -49,6 +49,7 @@ log = logging.getLogger(__name__)
 
 _RESOLUTIONS = (16, 1024)  # dense lattices: 1024 take some 4 GB for a body with its arms spread
 _LARGEST_PICTURE = 4096
+_TRUE_FRAMES, _TRUE_POINTS = 16, 300  # of the truth, so that all of it is in the picture
 
 
 @dataclass
@@ -139,7 +140,7 @@ def run(config: AnimateConfig) -> int:
         weight_colors=config.weight_colors,
         keep_share=config.keep_share,
         bone_transforms=chosen.bone_transforms,
-        screen=_screen(config, plan, avatar, chosen, canonical) if config.video else None,
+        screen=_screen(config, plan, avatar, chosen, canonical, truth) if config.video else None,
         truth=truth,
     )
     threads = max(1, (config.threads or count_cores()) // processes)
@@ -199,20 +200,29 @@ def _check(config: AnimateConfig) -> _Plan:
     return _Plan(numbers, views, parse_turntable(config.turntable), parse_processes(config.processes))
 
 
-def _screen(config: AnimateConfig, plan: _Plan, avatar: Avatar, chosen: ChosenMotion, canonical: Mesh | None) -> Screen:
+def _screen(
+    config: AnimateConfig, plan: _Plan, avatar: Avatar, chosen: ChosenMotion, canonical: Mesh | None, truth: Meshes | None
+) -> Screen:
     """Set the stage for a motion."""
     motion = chosen.motion
-    beside = None
+    points = body_points(avatar, motion.poses, motion.translation, canonical, chosen.bone_transforms)
+    also = beside = None
+    if truth is not None:
+        also = points[:, :_TRUE_POINTS].copy()
+        for frame in np.unique(np.linspace(0, len(points) - 1, _TRUE_FRAMES).astype(int)):
+            vertices = truth[frame][0]
+            also[frame] = vertices[np.linspace(0, len(vertices) - 1, also.shape[1]).astype(int)]
     if "canonical" in config.beside and canonical is not None:
         beside = place_canonical(canonical.vertices, canonical, 0.0, 0.0)
     stage = set_stage(
-        body_points(avatar, motion.poses, motion.translation, canonical, chosen.bone_transforms),
+        points,
         motion.poses,
         plan.views,
         frame_rate=motion.frame_rate,
         aspect=plan.size[0] / plan.size[1],
         camera=config.camera,
         turn_rad_s=plan.turn_rad_s,
+        also=also,
         beside=beside,
     )
     other = {"skinned", "field"} & set(config.beside)

@@ -79,7 +79,9 @@ def true_meshes(
         body = builtin_body()
         if data == "builtin":
             return BodyMeshes(body, bare.betas, poses, translation)
-        return ClothedMeshes(ClothedBody(body, bare), poses, translation)
+        clothed = ClothedBody(body, bare)
+        assert len(clothed.mesh.faces)  # the clothes are made here, in some seconds, and travel to other processes
+        return ClothedMeshes(clothed, poses, translation)
     is_stored = pose is None and layout_of(avatar.skeleton) != SMPL and choice.data.name != "builtin"
     if not is_stored:
         played = "pose files" if pose is not None else "built-in motions"

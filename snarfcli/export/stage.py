@@ -111,6 +111,7 @@ def set_stage(
     aspect: float = 1.0,
     camera: str = "still",
     turn_rad_s: float = 0.0,
+    also: np.ndarray | None = None,
     beside: np.ndarray | None = None,
 ) -> Stage:
     """Find cameras that see the body in all frames, from the side that it mostly faces, and the floor below it.
@@ -123,11 +124,14 @@ def set_stage(
         aspect: width over height of one picture.
         camera: one of `CAMERAS`.
         turn_rad_s: how fast the camera goes round the body.
+        also: [T, N, 3] metres, what must be seen too, but is not followed.
         beside: [N, 3] metres, something that stands beside it and must fit into a picture of its own; around x = z = 0.
     """
     heading_rad = _heading_rad(poses)
     middle = points.mean(axis=1) * (1, 0, 1)
     shifts = np.zeros_like(middle) if camera == "still" else _smooth(middle, frame_rate)
+    tall = float(np.median(np.ptp(points[..., 1], axis=1)))
+    points = points if also is None else np.concatenate([points, also], axis=1)
     seen = (points - shifts[:, None]).reshape(-1, 3)
     lower, upper = seen.min(axis=0), seen.max(axis=0)
     pivot = (lower + upper) / 2
@@ -156,7 +160,6 @@ def set_stage(
         distances += [one.distance_to_see(beside, aspect=aspect) for one in aimed]
     cameras = [one.at(max(distances)) for one in cameras]
     moves = camera != "still" or bool(turn_rad_s)
-    tall = float(np.median(np.ptp(points[..., 1], axis=1)))
     return Stage(
         tuple(views),
         tuple(cameras),

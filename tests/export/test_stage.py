@@ -86,6 +86,17 @@ def test_what_stands_beside_fits_too_at_the_same_scale():
         np.testing.assert_allclose(*offsets)
 
 
+def test_what_must_be_seen_too_is_seen_but_not_followed():
+    points, poses = walk()
+    also = points[:, :3].copy()
+    also[20] += (0, 1.0, 0)
+    also[40, :, 1] -= 0.5
+    alone, both = (set_stage(points, poses, parse_views(["left"]), camera="follow", also=more) for more in (None, also))
+    np.testing.assert_array_equal(both.shifts, alone.shifts)
+    assert both.ground.height < alone.ground.height
+    assert places(alone, 0, 20, also[20]).min() < 0.05 <= places(both, 0, 20, also[20]).min()
+
+
 def test_views_and_turntables_that_nobody_can_show_are_refused():
     assert [view.label for view in parse_views(["top", "45", "-30.5"])] == ["top", "45°", "-30.5°"]
     for names, message in (

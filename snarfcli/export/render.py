@@ -4,7 +4,7 @@ DESIGN. Primary rays are cast only inside the mesh's box on the screen, `supersa
 dome and a large key light, both tested for occlusion with a few rays a pixel; neighbouring pixels turn the same
 directions differently and a small blur joins them, so that 12 rays look like a hundred. What does not change from picture
 to picture is kept: a `Solid` serves several cameras, a `Backdrop` all pictures of a camera that stands still. A body at
-512 x 512 takes a sixth of a second of one core (benchmarks/bm_video.py).
+512 x 512 takes a fifth of a second of one core (benchmarks/bm_video.py).
 """
 
 from __future__ import annotations

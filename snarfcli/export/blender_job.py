@@ -23,8 +23,10 @@ def main(glb: str, path: str, frame_rate: str) -> None:
     bpy.ops.import_scene.gltf(filepath=glb, disable_bone_shape=True)
     scene.render.fps_base = scene.render.fps / rate  # all others divide by it
     for item in [item for item in bpy.data.objects if item.type == "EMPTY"]:
-        bpy.data.objects.remove(item)  # what the importer makes of the node of a skinned mesh
+        bpy.data.objects.remove(item)  # what the importer makes of the node of a skinned mesh, and calls as the mesh should be
     meshes = [item for item in bpy.data.objects if item.type == "MESH"]
+    for item in meshes:
+        item.name = item.data.name
     moving = [item for item in bpy.data.objects if item.type == "ARMATURE"]
     moving += [item.data.shape_keys for item in meshes if item.data.shape_keys]
     scene.frame_end = _lay_out([item.animation_data for item in moving if item.animation_data])

@@ -21,6 +21,7 @@ NO_MOTION = "none"
 _AXES = ("x", "y", "z")
 _SPEEDS = (0.1, 2.0)
 _TEXT_EVERY_S = 0.25
+_MEASURED, _MEASURED_S = 31, 6.0  # frames and seconds that the rate is measured over
 _SAME_RAD = 2e-3  # sliders count tenths of a degree
 _REACH_M = 3.0  # of the slider for the height, about the body's size of a person
 
@@ -214,7 +215,7 @@ class Controls:
     def _save(self, client: Any) -> None:
         if client is not None:
             posed = self._viewing.posed
-            client.send_file_download("pose.npz", pose_file(posed.pose, posed.translation))
+            client.send_file_download("pose.npz", pose_file(posed.pose, posed.translation), save_immediately=True)
 
     def _choose_motion(self, name: str, client: Any) -> None:
         self._notice = None
@@ -289,14 +290,15 @@ class Controls:
 
     def _status(self, picture: Picture, now: float) -> str:
         """Return what is shown, how fast, and what went wrong, as Markdown."""
-        self._changes = [time for time in self._changes if time > now - 1.0]
-        rate = len(self._changes)
+        self._changes = [time for time in self._changes[-_MEASURED:] if time > now - _MEASURED_S]
+        spans = len(self._changes) - 1
+        rate = spans / max(self._changes[-1] - self._changes[0], 1e-3) if spans > 0 else 0.0
         title = " · ".join(value for name, value in self._facts.items() if name in ("subject", "data", "model"))
         mesh = picture.mesh
         parts = ["no surface yet"] if mesh is None else [mesh.surface, f"{len(mesh.vertices):,} vertices"]
         times = []
         if picture.is_playing:
-            times.append(f"{rate} frames a second")
+            times.append(f"{rate:.{0 if rate >= 10 else 1}f} frames a second")
         elif picture.is_computing:
             times.append("computing …")
         if mesh is not None and mesh.seconds is not None:

@@ -50,7 +50,8 @@ class Scene:
         self.chosen_joint = 0
         self._shown: tuple | None = None
         self._is_turning = False
-        joints = posed_joints(self._skeleton, viewing.posed.transforms)
+        rest = viewing.body.transforms(np.zeros((self._skeleton.num_joints, 3)), np.zeros(3))
+        joints = posed_joints(self._skeleton, rest)
         self.size = float(max(np.ptp(joints, axis=0).max(), 0.1))
         self._aside = float(1.15 * max(np.ptp(joints[:, 0]), 0.6 * self.size))
         server.scene.set_up_direction("+y")
@@ -145,7 +146,7 @@ class Scene:
     def _make_skeleton(self, joints: np.ndarray) -> None:
         import trimesh
 
-        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.011 * self.size)
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.015 * self.size)
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(joints), 1))
         self._joints = self._server.scene.add_batched_meshes_simple(
             "/skeleton/joints", ball.vertices, ball.faces, turns, joints, lod="off", cast_shadow=False,
@@ -169,7 +170,7 @@ class Scene:
 
     def _square(self) -> float:
         """Return the width of a square of the floor: a metre for people, a power of ten that suits other sizes."""
-        return float(10.0 ** np.floor(np.log10(self.size)))
+        return float(10.0 ** np.round(np.log10(self.size / 1.3)))
 
     def _camera(self, shows_canonical: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return where a camera stands and looks at, metres: in front of the body, somewhat to its left."""
@@ -181,5 +182,6 @@ class Scene:
             low[0] -= self._aside
         look_at = (low + high) / 2 + (0.10 * self.size, 0.0, 0.0)  # the panel covers the right side
         distance = _ROOM * max(high[0] - low[0], self.size) / np.tan(_FIELD_OF_VIEW_RAD / 2)
+        distance += np.ptp(joints[:, 2]) / 2
         ahead = np.array([0.42, 0.22, 1.0])
         return look_at + distance * ahead / np.linalg.norm(ahead), look_at

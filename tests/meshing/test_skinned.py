@@ -93,8 +93,26 @@ def test_where_the_shape_ends_vertices_go_along_with_their_neighbours():
     ways = radii(surface.canonical_vertices(twisted(1.0))) - RADIUS
     band = (np.abs(surface.mesh.vertices[:, 0] - LENGTH) < 0.04) & (surface.mesh.vertices[:, 1] > 0)
     assert band.sum() > 20
-    np.testing.assert_allclose(ways[~band], 0.01, atol=2e-4)
+    np.testing.assert_allclose(ways[~band], 0.01, atol=3e-4)  # those next to the band lean towards it a little
     np.testing.assert_allclose(ways[band], 0.01, atol=2e-3)
+
+
+def test_a_point_that_finds_another_surface_than_its_neighbours_does_not_jump():
+    """In some pose a hair-thin spike stands on the body, as what a normal meets across a crease."""
+
+    class Spiked(Breathing):
+        def canonical_logits(self, points_c: Tensor, pose: Tensor) -> Tensor:
+            logits = super().canonical_logits(points_c, pose)
+            spike = (pose[1, 0] > 0.5) & ((points_c[:, 0] - 0.3).abs() < 0.012) & (points_c[:, 2].abs() < 0.012)
+            height = self.radius_in(pose) + 0.02 - points_c[:, 1]
+            return torch.where(spike & (points_c[:, 1] > 0), 20 * torch.tanh(60 * height), logits)
+
+    surface = SkinnedSurface(Spiked(), 48)
+    pose = twisted(1.0)
+    way, _ = surface._control.nearest_ways(pose)
+    assert way.max() > 0.025  # found, and not believed
+    ways = radii(surface.canonical_vertices(pose)) - RADIUS
+    np.testing.assert_allclose(ways, 0.01, atol=1.5e-3)
 
 
 def test_a_shape_that_vanishes_is_reported():

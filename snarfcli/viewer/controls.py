@@ -265,7 +265,7 @@ class Controls:
             self._seen_pose = picture.posed.number
             self._set_angles(self._angles, picture.posed.pose[self.joint])
             self._set_angles(self._turns, picture.posed.pose[0])
-            self._height.value = float(np.clip(picture.posed.translation[1], -_REACH_M, _REACH_M))
+            self._height.value = _rounded(np.clip(picture.posed.translation[1], -_REACH_M, _REACH_M), 2)
             self._set_frame(picture.frame)
         if now < self._next_text:
             return self._next_text - now
@@ -286,7 +286,7 @@ class Controls:
         if (stand.inv() * Rotation.from_rotvec(vector)).magnitude() < _SAME_RAD:
             return
         for slider, angle in zip(sliders, angles_of(vector), strict=True):
-            slider.value = round(angle, 1)
+            slider.value = _rounded(angle, 1)
 
     def _status(self, picture: Picture, now: float) -> str:
         """Return what is shown, how fast, and what went wrong, as Markdown."""
@@ -307,6 +307,11 @@ class Controls:
         lines = [f"**{title}**", " · ".join(parts), " · ".join(times) or "&nbsp;"]
         lines += [f"⚠ {text}" for text in (self._notice, picture.message) if text]
         return "  \n".join(lines)
+
+
+def _rounded(number: float, digits: int) -> float:
+    """Return a number as sliders show it; without the sign of a rounded zero."""
+    return round(float(number), digits) + 0.0
 
 
 def _on_user(handle: Any, react: Callable[[Any, Any], None]) -> None:

@@ -23,7 +23,8 @@ BODY_COLOR = (205, 184, 168)
 _BONE, _JOINT, _CHOSEN = (70, 80, 95), (255, 214, 102), (235, 94, 40)  # sRGB
 _SEE_THROUGH = 0.45  # opacity of a body whose skeleton is to be seen inside of it
 _FIELD_OF_VIEW_RAD = 0.6
-_ROOM = 0.78  # half the height of the picture over the size of the body
+_ROOM, _ROOM_ASIDE = 0.74, 0.46  # half the height of the picture over the size of one body, and over the width of two
+_PANEL = 0.3  # how far the middle is shifted for the panel, which covers the right side
 
 
 class Scene:
@@ -180,8 +181,9 @@ class Scene:
         low, high = middle - half, middle + half
         if shows_canonical:
             low[0] -= self._aside
-        look_at = (low + high) / 2 + (0.10 * self.size, 0.0, 0.0)  # the panel covers the right side
-        distance = _ROOM * max(high[0] - low[0], self.size) / np.tan(_FIELD_OF_VIEW_RAD / 2)
-        distance += np.ptp(joints[:, 2]) / 2
+        # half the height of the picture at the body, metres; the picture is wider than high
+        reach = max(_ROOM * self.size, _ROOM_ASIDE * (high[0] - low[0]))
+        distance = reach / np.tan(_FIELD_OF_VIEW_RAD / 2) + np.ptp(joints[:, 2]) / 2
+        look_at = (low + high) / 2 + (_PANEL * reach, 0.0, 0.0)
         ahead = np.array([0.42, 0.22, 1.0])
         return look_at + distance * ahead / np.linalg.norm(ahead), look_at

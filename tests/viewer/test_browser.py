@@ -36,7 +36,8 @@ def load_motion(name: str):
 
 @pytest.fixture
 def page():
-    server = ViewServer(ToyAvatar(), replace(SMALL, weight_colors=True), motions=["bend"], load_motion=load_motion, facts={"subject": "toy"})
+    look = replace(SMALL, weight_colors=True)
+    server = ViewServer(ToyAvatar(), look, motions=["bend"], load_motion=load_motion, facts={"subject": "toy"})
     with playwright.sync_playwright() as program:
         browser = program.chromium.launch(executable_path=CHROMIUM, args=list(_FLAGS))
         page = browser.new_page(viewport={"width": 1000, "height": 600})

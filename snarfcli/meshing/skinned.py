@@ -33,6 +33,7 @@ _FARTHEST_M = 0.03  # that the pose may move a point of the canonical surface al
 # normal meets the surface of the other side, or none, and may do so in one frame and not in the next.
 # With these, of 230,000 motions of a point from one frame to the next, 8 instead of 230 are longer than 5 mm in punching.
 _OUTLIER_M = 0.003
+_FILLINGS = 20  # rounds in which points that found nothing take the mean of their neighbours
 _ROUNDS = 5  # of smoothing
 _PULL = 0.1  # weight of the neighbours beside a point that agrees with them
 _MOST_LOST = 0.5  # share of lost points beyond which there is no surface to speak of
@@ -136,6 +137,8 @@ class _Followed:
         # gradually: a point that is believed in one frame and not in the next would jump.
         found = 1 / (1 + (last_step / _LOST_M) ** 2)
         smooth = way * found
+        for _ in range(_FILLINGS):
+            smooth = found * way + (1 - found) * (self.neighbours @ smooth)
         for _ in range(_ROUNDS):
             around = self.neighbours @ smooth
             trust = found / (1 + ((way - around) / _OUTLIER_M) ** 4)

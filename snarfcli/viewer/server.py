@@ -128,6 +128,7 @@ class ViewServer:
 
         self._woken = threading.Event()
         self._is_stopped = False
+        self._is_ready = False  # whether there is something to see
         self.viewing = Viewing(Body(avatar), look, self._woken.set)
         with _silence():
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -149,6 +150,7 @@ class ViewServer:
         )
         if first_motion is not None:
             self.viewing.play()
+        self.server.on_client_connect(lambda client: self._woken.set())
         self._thread = threading.Thread(target=self._run, name="snarf-view", daemon=True)
         self._thread.start()
 
@@ -182,6 +184,8 @@ class ViewServer:
             except Exception as error:  # one picture that fails must not end the viewer
                 log.error("the viewer goes on after: %s: %s", type(error).__name__, error, exc_info=error)
                 waits = [1.0]
+            if self._is_ready and not self.server.get_clients():
+                waits = []  # nobody looks: no need to play
             timeout = min((wait for wait in waits if wait is not None), default=None)
             rest = _SHORTEST_S - (time.monotonic() - start)
             if rest > 0:  # changes that come meanwhile go into the next picture together
@@ -191,6 +195,7 @@ class ViewServer:
     def _step(self) -> list[float | None]:
         """Show the present picture; return for how many seconds each part is content."""
         picture, frame_wait = self.viewing.picture()
+        self._is_ready = picture.mesh is not None or picture.message is not None
         self.scene.show(picture)
         return [frame_wait, self.scene.advance(), self.controls.follow(picture)]
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.viewer.body import Body, Posed
+from snarfcli.viewer.body import Body, MakeShape, Posed
 from snarfcli.viewer.joints import mirrored_joint
 from snarfcli.viewer.made import MadeSurfaces
 from snarfcli.viewer.picture import Look, Picture
@@ -20,6 +20,7 @@ from snarfcli.viewer.worker import Worker
 
 __all__ = ["Viewing"]
 
+_SHAPE_EVERY_S = 0.1  # while playing
 _FLOOR_FRAMES = 40  # of a motion, looked at to find its floor
 
 
@@ -51,6 +52,7 @@ class Viewing:
         self._lock = threading.RLock()
         self._worker = Worker(body.make, wake)
         self._frame = 0
+        self._next_shape = 0.0
         self._made = MadeSurfaces(body)
         zeros = np.zeros((body.skeleton.num_joints, 3))
         self._posed = Posed(0, zeros, np.zeros(3), body.transforms(zeros, np.zeros(3)))
@@ -166,8 +168,10 @@ class Viewing:
                 self._find_floor()
             posed, look = self._posed, self.look
             request = self._made.wanted(posed, look)
-            if request is not None:
-                self._worker.start(request)
+            # the shape changes slowly: while playing, leave the processor to the browser in between
+            is_due = not (self.player.is_playing and isinstance(request, MakeShape)) or now >= self._next_shape
+            if request is not None and is_due and self._worker.start(request):
+                self._next_shape = now + _SHAPE_EVERY_S
             picture = Picture(
                 posed,
                 self._made.shown(posed, look, self.player.is_playing),

@@ -50,11 +50,12 @@ class Worker:
             outcome, self._outcome = self._outcome, None
             return outcome
 
-    def stop(self) -> None:
-        """Take no more requests; what is being done is left to itself."""
+    def stop(self, patience_s: float = 60.0) -> None:
+        """Take no more requests, and wait for what is being done: a process that ends in the middle of it aborts."""
         with self._changed:
             self._is_stopped = True
             self._changed.notify_all()
+        self._thread.join(timeout=patience_s)
 
     def _run(self) -> None:
         while True:

@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 
 _LEGS = (("l_hip", "l_knee"), ("l_knee", "l_ankle"), ("r_hip", "r_knee"), ("r_knee", "r_ankle"))
 _FARTHEST_M = 1e6
+_SAME_SKELETON_M = 1e-3  # how far apart joints may be, from their parents, in two files of one skeleton
 
 
 def choose_clip(rig: Rig, clip: str | int | None, path: Path) -> Clip:
@@ -75,8 +76,8 @@ def retarget(
 
     Bones of arms, legs and fingers, and of skeletons that are no human body all bones, point as they do in the file. The trunk,
     the head and the feet turn as they do there. Joints without a counterpart follow their parents. Ways are scaled by the
-    length of the legs, or of all bones where there are none, and the hips go where the file's go. A rig with the names and the
-    rest pose of the skeleton gives its poses back.
+    length of the legs, or of all bones where there are none, and the hips go where the file's go. A rig of the skeleton itself
+    gives its poses back, also if it rests in another pose, as exported avatars do.
 
     Args:
         rig: where the motion comes from.
@@ -100,6 +101,7 @@ def retarget(
         log.info("%s: without a counterpart, so they follow their parents: %s", path.name, ", ".join(left))
     parts = find_body_parts(skeleton.names, skeleton.parents)
     joints_rest = skeleton.joints_rest.detach().cpu().double().numpy()
+    rig = _straightened(rig, skeleton, pairs)
     match = RestMatch(
         pairs, parts.joints, parts.spine, joints_rest, rig.rest[:, :3, 3], skeleton.parents, rig.parents
     )
@@ -126,6 +128,35 @@ def retarget(
     if not np.abs(translation).max() < _FARTHEST_M:
         raise UserError(f"{path}: the body goes over {_FARTHEST_M / 1000:g} km away; check the numbers of its root")
     return Motion(name, poses, translation, clip.frame_rate)
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def _straightened(rig: Rig, skeleton: Skeleton, pairs: Mapping[int, int]) -> Rig:
+    """Return a rig of the skeleton's own joints with the skeleton's rest pose, whatever pose it rests in; any other as it is.
+
+    It is the same skeleton if each joint lies where the skeleton has it, seen from its parent's frame.
+    """
+    parents = [rig.parents[pairs[joint]] if joint in pairs else None for joint in range(skeleton.num_joints)]
+    if any(parent != pairs.get(own, -1) for parent, own in zip(parents, skeleton.parents, strict=True)):
+        return rig
+    frames = rig.rest[[pairs[joint] for joint in range(skeleton.num_joints)]]
+    joints_rest = skeleton.joints_rest.detach().cpu().double().numpy()
+    below = [joint for joint, parent in enumerate(skeleton.parents) if parent >= 0]
+    above = [skeleton.parents[joint] for joint in below]
+    try:
+        local = np.linalg.solve(frames[above], frames[below])[:, :3, 3]
+    except np.linalg.LinAlgError:
+        return rig
+    wanted = joints_rest[below] - joints_rest[above]
+    scale = (local * wanted).sum() / max((wanted * wanted).sum(), 1e-30)
+    if not scale > 0 or np.abs(local / scale - wanted).max() > _SAME_SKELETON_M:
+        return rig
+    sizes = np.linalg.norm(frames[:, :3, :3], axis=1)  # of the axes
+    rest = rig.rest.copy()
+    for joint, number in pairs.items():
+        rest[number, :3, :3] = np.diag(sizes[joint])
+        rest[number, :3, 3] = frames[0, :3, 3] + scale * sizes[0].mean() * (joints_rest[joint] - joints_rest[0])
+    return replace(rig, rest=rest)
 
 
 def _turned(rig: Rig, clip: Clip, number: int, path: Path) -> Array:

@@ -14,7 +14,7 @@ from toy_animal import animal_motion, make_animal
 from toy_animal_files import animal_glb, write_animal_bvh
 from toy_rigs import CMU_NAMES, MIXAMO_NAMES, a_pose, rig_of, write_bvh
 
-from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, builtin_body, forward_kinematics
+from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, builtin_body, forward_kinematics, legs_apart_pose
 from snarfcli.errors import UserError
 from snarfcli.formats.rig import Clip, Rig
 from snarfcli.motions import builtin_motion, read_motion
@@ -47,6 +47,26 @@ def test_the_skeletons_own_rig_gives_its_poses_back(tmp_path, motion):
     difference = Rotation.from_rotvec(back.poses.reshape(-1, 3)).inv() * Rotation.from_rotvec(motion.poses.reshape(-1, 3))
     assert difference.magnitude().max() < 1e-7
     np.testing.assert_allclose(back.translation, motion.translation, atol=1e-7)
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0])
+@pytest.mark.parametrize("motion", [STANDING, EXTREME], ids=lambda motion: motion.name)
+def test_its_own_rig_may_rest_in_another_pose(motion, scale):
+    """Exported avatars rest with their legs apart; feet must not be taken to be turned for that."""
+    skeleton = replace(smpl(), canonical_pose=legs_apart_pose(SMPL_JOINT_NAMES, torch.float64))
+    frames = forward_kinematics(
+        torch.cat([skeleton.canonical_pose[None], torch.as_tensor(motion.poses)]),
+        skeleton.joints_rest,
+        PARENTS,
+        torch.cat([torch.zeros(1, 3, dtype=torch.float64), torch.as_tensor(motion.translation)]),
+    )
+    at = np.tile(np.eye(4), (len(motion.poses) + 1, 24, 1, 1))
+    at[:, :, :3, :3], at[:, :, :3, 3] = frames[1][:, :, :3, :3], scale * frames[0].numpy()
+    rig = Rig(SMPL_JOINT_NAMES, PARENTS, at[0], (Clip("own", motion.frame_rate, at[1:]),))
+    back = retarget(rig, rig.clips[0], skeleton, path="own.glb", name="own", up="y")
+    difference = Rotation.from_rotvec(back.poses.reshape(-1, 3)).inv() * Rotation.from_rotvec(motion.poses.reshape(-1, 3))
+    assert difference.magnitude().max() < 1e-6
+    np.testing.assert_allclose(back.translation, motion.translation, atol=1e-6)
 
 
 @pytest.mark.parametrize("names", [CMU_NAMES, MIXAMO_NAMES, SMPL_JOINT_NAMES], ids=["cmu", "mixamo", "smpl"])

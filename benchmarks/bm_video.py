@@ -22,7 +22,7 @@ from snarfcli.export.stage import body_points, set_stage
 from snarfcli.export.views import parse_views
 from snarfcli.models.avatar import Avatar
 from snarfcli.motions import builtin_motion
-from snarfcli.sampling.parallel import count_cores
+from snarfcli.parallel import count_cores
 
 
 def main() -> None:

@@ -40,8 +40,8 @@ from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import SURFACES, canonical_surface
 from snarfcli.models.avatar import Avatar
 from snarfcli.motions import Motion
+from snarfcli.parallel import count_cores
 from snarfcli.runs import machine_facts
-from snarfcli.sampling.parallel import count_cores
 
 __all__ = ["AnimateConfig", "run"]
 

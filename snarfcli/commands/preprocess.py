@@ -59,7 +59,8 @@ def run(config: PreprocessConfig) -> None:
     """
     from snarfcli.datasets.preprocessing import preprocess_subject
     from snarfcli.datasets.sources import Request, find_source
-    from snarfcli.sampling import SamplingSettings, count_cores
+    from snarfcli.parallel import count_cores
+    from snarfcli.sampling import SamplingSettings
 
     source = find_source(config.data.name)
     sampling = SamplingSettings(

@@ -25,14 +25,15 @@ from snarfcli.datasets.writing import (
     write_manifest,
 )
 from snarfcli.errors import UserError, nearest
+from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
-from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, run_in_processes, sample_frames
+from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, sample_frames
 
 __all__ = ["preprocess_subject"]
 
 log = logging.getLogger(__name__)
 
-_FRAMES_PER_TASK = 30  # 3 to 4 s of work for 0.4 s of starting a process; the samples depend on it, see sampling/parallel
+_FRAMES_PER_TASK = 30  # 3 to 4 s of work for 0.4 s of starting a process; the samples depend on it, see snarfcli/parallel.py
 _FRAMES_CHECKED = 200  # that a process only reads
 _PACKAGES = ("snarf", "numpy", "torch", "libigl", "pymeshlab", "trimesh", "embreex")
 

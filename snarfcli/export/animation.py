@@ -23,8 +23,8 @@ from snarfcli.export.panels import Screen
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import AvatarLike, posed_mesh
+from snarfcli.parallel import Worker, interrupts_held_back
 from snarfcli.progress import progress
-from snarfcli.sampling.parallel import Worker, interrupts_held_back
 
 __all__ = ["CONTENTS", "Animation", "FrameRecord", "Meshes"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from snarfcli.errors import UserError
-from snarfcli.sampling.parallel import count_cores
+from snarfcli.parallel import count_cores
 
 __all__ = ["choose_processes", "parse_processes"]
 

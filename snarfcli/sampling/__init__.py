@@ -9,7 +9,6 @@ from snarfcli.sampling.occupancy import (
     ray_parity,
     winding_numbers,
 )
-from snarfcli.sampling.parallel import Worker, count_cores, interrupts_held_back, run_in_processes
 from snarfcli.sampling.planar import in_turned_over, outline_samples
 from snarfcli.sampling.points import (
     CUBE_PADDING,
@@ -35,22 +34,18 @@ __all__ = [
     "BrokenFrame",
     "FrameSamples",
     "SamplingSettings",
-    "Worker",
     "check_frames",
     "check_mesh",
     "count_boundary_edges",
-    "count_cores",
     "dequantise",
     "frame_generator",
     "in_turned_over",
-    "interrupts_held_back",
     "labels_differ",
     "occupancies",
     "outline_samples",
     "pack_vertices",
     "quantise",
     "ray_parity",
-    "run_in_processes",
     "sample_frame",
     "sample_frames",
     "sampling_cube",

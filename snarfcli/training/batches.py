@@ -10,7 +10,7 @@ from torch import Tensor
 
 from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
-from snarfcli.sampling import count_cores
+from snarfcli.parallel import count_cores
 from snarfcli.training.fresh import DrawnPoints, FreshPoints, draw_steps
 from snarfcli.training.prefetch import Prefetch
 from snarfcli.training.settings import TrainingConfig

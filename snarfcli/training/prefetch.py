@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from snarfcli.sampling.parallel import Worker, interrupts_held_back
+from snarfcli.parallel import Worker, interrupts_held_back
 
 __all__ = ["Prefetch"]
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from snarfcli.errors import UserError
-from snarfcli.sampling import run_in_processes
+from snarfcli.parallel import run_in_processes
 
 
 def _count(start: int, stop: int) -> Iterator[tuple[int, int]]:

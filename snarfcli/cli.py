@@ -168,6 +168,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(_shown())}", file=sys.stderr)
         return EXIT_USER_ERROR
     command = COMMANDS[arguments[0]]
+    # Before PyTorch is loaded: its threads would otherwise spin for milliseconds after every operation, on the cores that the
+    # native library's threads and other processes wait for. Training steps take as long either way.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     _set_up_logging()
     try:
         return _run(command, arguments[1:])

@@ -1,6 +1,7 @@
 // Checks, packs and runs a network (snarf_network) on all threads.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <new>
 #include <vector>
@@ -89,10 +90,12 @@ class Network {
     packed.activation = layer.activation;
     const int64_t inputs = packed.hidden + packed.encoded + packed.extras;
     std::vector<float> weights(size_t(packed.outputs * inputs), 0.f), bias(size_t(packed.outputs), 0.f);
-    for (int64_t o = 0; o < layer.outputs; ++o) {
-      bias[size_t(o)] = layer.bias[o];
-      for (int64_t k = 0; k < inputs; ++k)
-        weights[size_t((o / kOutputs * inputs + k) * kOutputs + o % kOutputs)] = layer.weights[o * inputs + k];
+    std::copy(layer.bias, layer.bias + layer.outputs, bias.begin());
+    for (int64_t block = 0; block < layer.outputs; block += kOutputs) {
+      const int64_t rows = std::min<int64_t>(kOutputs, layer.outputs - block);
+      float* to = &weights[size_t(block * inputs)];
+      for (int64_t k = 0; k < inputs; ++k, to += kOutputs)
+        for (int64_t o = 0; o < rows; ++o) to[o] = layer.weights[(block + o) * inputs + k];
     }
     layers_.push_back(packed);
     weights_.push_back(std::move(weights));

@@ -23,6 +23,7 @@ __all__ = ["SkinnedSurface"]
 # against finding it at every vertex of a mesh of 256, 0.2 mm in the mean (benchmarks/bm_surfaces.py).
 _CONTROL_RESOLUTION = 96
 _STEPS = 8
+_FEWEST = 0.005  # share of the points that are not worth another step: they are in creases, and will hardly be believed
 _REACHED_M = 1e-4  # a step this short ends the search; two evaluations a point suffice in the mean
 _LOST_M = 1e-3  # a point whose last step was longer has no level set along its normal
 _SLOPE_M = 0.002  # half the distance over which the slope along a normal is measured
@@ -168,7 +169,7 @@ class _Followed:
             last_step[left] = step
             going = np.abs(step) > _REACHED_M
             left, before, last, slope = (values[going] for values in (left, before, last, slope))
-            if not len(left):
+            if len(left) <= _FEWEST * len(way):
                 break
         return way, last_step
 

@@ -25,11 +25,11 @@ from snarfcli.export.rig import (
     decompose,
     local_frames,
     recompose,
-    skin_vertices,
     unique_names,
 )
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
+from snarfcli.meshing.skinned import skin_vertices
 from snarfcli.progress import progress
 
 if TYPE_CHECKING:
@@ -211,11 +211,11 @@ def build_character(avatar: Avatar, surface: SkinnedSurface, clips: Sequence[Cli
         found = basis.weights(shape)
         shape_weights[clip][frame] = found
         blended = basis.shape(found)
-        wanted = skin_vertices(shape, transforms[clip][frame], mesh.weights)
-        truncation.add(wanted - skin_vertices(shape, transforms[clip][frame], few))
+        wanted = skin_vertices(shape, mesh.weights, transforms[clip][frame])
+        truncation.add(wanted - skin_vertices(shape, few, transforms[clip][frame]))
         shape_motion.add(shape - basis.base)
         shape_error.add(shape - blended)
-        deviation.add(wanted - skin_vertices(blended, read_back[clip][frame], few))
+        deviation.add(wanted - skin_vertices(blended, few, read_back[clip][frame]))
     basis, shape_weights = basis.within_unit_range([_filled(of_clip) for of_clip in shape_weights])
     base = Mesh(basis.base, mesh.faces, weights=mesh.weights, normals=vertex_normals(basis.base, mesh.faces))
     return Character(

@@ -27,7 +27,6 @@ __all__ = [
     "decompose",
     "local_frames",
     "recompose",
-    "skin_vertices",
     "unique_names",
 ]
 
@@ -113,12 +112,6 @@ def recompose(transforms: LocalTransforms, parents: Sequence[int]) -> NDArray[np
         if parent >= 0:
             local[..., joint, :, :] = local[..., parent, :, :] @ local[..., joint, :, :]
     return local
-
-
-def skin_vertices(vertices: NDArray, transforms: NDArray[np.float64], weights: NDArray) -> NDArray[np.float64]:
-    """Move canonical vertices [V, 3] by bone transforms [J, 4, 4] and weights [V, J], in float64; metres."""
-    blended = (weights.astype(np.float64) @ transforms[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
-    return np.einsum("vab,vb->va", blended[:, :, :3], vertices.astype(np.float64)) + blended[:, :, 3]
 
 
 def unique_names(names: Sequence[str]) -> list[str]:

@@ -17,7 +17,7 @@ from snarfcli.meshing.surfaces import AvatarLike, canonical_surface, check_posed
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-__all__ = ["SkinnedSurface"]
+__all__ = ["SkinnedSurface", "skin_vertices"]
 
 # The motion of the shape with the pose is found at the vertices of a coarser mesh, 2 cm apart on a body, and interpolated:
 # against finding it at every vertex of a mesh of 256, 0.2 mm in the mean (benchmarks/bm_surfaces.py).
@@ -102,7 +102,7 @@ class SkinnedSurface:
             EmptySurface: in this pose the shape has no surface near most of the vertices.
         """
         pose, transforms = check_posed(self._avatar, pose, translation, transforms)
-        vertices = _skin(self.canonical_vertices(pose), self.mesh.weights, transforms.cpu().numpy())
+        vertices = skin_vertices(self.canonical_vertices(pose), self.mesh.weights, transforms.cpu().numpy())
         return replace(self.mesh, vertices=vertices, normals=vertex_normals(vertices, self.mesh.faces))
 
 
@@ -208,7 +208,13 @@ def _nearest_points(vertices: NDArray[np.float32], mesh: Mesh) -> tuple[NDArray[
     return index, np.asarray(shares, dtype=np.float32)
 
 
-def _skin(vertices: NDArray[np.float32], weights: NDArray[np.float32], transforms: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Move canonical points [V, 3] with weights [V, J] by bone transforms [J, 4, 4] (S Eq. 4)."""
+def skin_vertices(vertices: NDArray, weights: NDArray, transforms: NDArray) -> NDArray:
+    """Move canonical vertices by linear blend skinning, in the precision of the most precise input (S Eq. 4).
+
+    Args:
+        vertices: [V, 3] metres.
+        weights: [V, J], rows sum to 1.
+        transforms: [J, 4, 4] canonical to posed, metres.
+    """
     blended = (weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
     return np.einsum("vrc,vc->vr", blended[:, :, :3], vertices) + blended[:, :, 3]

@@ -23,7 +23,6 @@ __all__ = [
     "MakeShape",
     "Posed",
     "ShapeMade",
-    "skin_vertices",
 ]
 
 Floats = NDArray[np.float32]
@@ -139,15 +138,3 @@ class Body:
             transforms=torch.from_numpy(request.posed.transforms),
         )
         return FieldMade(request.posed, request.resolution, mesh, time.perf_counter() - start)
-
-
-def skin_vertices(vertices_c: Floats, weights: Floats, transforms: Floats) -> Floats:
-    """Move canonical vertices [V, 3] by linear blend skinning (S Eq. 4); a millisecond for ten thousand.
-
-    Args:
-        vertices_c: [V, 3] metres.
-        weights: [V, J], rows sum to 1.
-        transforms: [J, 4, 4] canonical to posed.
-    """
-    blended = (weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
-    return np.einsum("vrc,vc->vr", blended[:, :, :3], vertices_c) + blended[:, :, 3]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
+from snarfcli.meshing.skinned import skin_vertices
 from snarfcli.viewer.body import (
     Body,
     CanonicalMade,
@@ -20,7 +21,6 @@ from snarfcli.viewer.body import (
     MakeShape,
     Posed,
     ShapeMade,
-    skin_vertices,
 )
 from snarfcli.viewer.joints import posed_joints
 from snarfcli.viewer.picture import Look, ShownMesh

@@ -16,10 +16,10 @@ from snarfcli.errors import UserError
 from snarfcli.export import character_glb
 from snarfcli.export.character import CharacterOptions, character_surface
 from snarfcli.export.exporting import export_character
-from snarfcli.export.rig import Clip, skin_vertices
+from snarfcli.export.rig import Clip
 from snarfcli.formats.gltf import read_gltf
 from snarfcli.meshing.extract import EmptySurface
-from snarfcli.meshing.skinned import SkinnedSurface
+from snarfcli.meshing.skinned import SkinnedSurface, skin_vertices
 
 WHOLE = CharacterOptions(triangles=None, morph_targets=8, resolution=40)
 FEW = replace(WHOLE, triangles=600)
@@ -90,7 +90,7 @@ def test_between_keys_the_joints_turn_evenly(toy, tmp_path):
         transforms = toy.skeleton.to(torch.float64).posed_from_canonical(
             torch.from_numpy(finer.poses[frame][None]), torch.from_numpy(finer.translation[frame][None])
         )
-        wanted = skin_vertices(positions, transforms[0].numpy(), weights)
+        wanted = skin_vertices(positions, weights, transforms[0].numpy())
         assert largest(reader.vertices("wave", frame / finer.frame_rate), wanted) < 1e-5  # float32 keys
 
 

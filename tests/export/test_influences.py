@@ -5,7 +5,8 @@ import pytest
 from toy_character import ToyCharacter, wave
 
 from snarfcli.export.influences import dense_weights, few_influences, trial_poses
-from snarfcli.export.rig import Clip, clip_transforms, skin_vertices
+from snarfcli.export.rig import Clip, clip_transforms
+from snarfcli.meshing.skinned import skin_vertices
 
 TOY = ToyCharacter(spread=0.16)
 MESH = TOY.skinned_surface(32).mesh
@@ -14,7 +15,7 @@ TRIALS = trial_poses(TOY.skeleton, CLIP)
 
 
 def rms_mm(dense: np.ndarray, poses: np.ndarray) -> float:
-    apart = [skin_vertices(MESH.vertices, pose, MESH.weights) - skin_vertices(MESH.vertices, pose, dense) for pose in poses]
+    apart = [skin_vertices(MESH.vertices, MESH.weights, pose) - skin_vertices(MESH.vertices, dense, pose) for pose in poses]
     return 1000 * float(np.sqrt(np.square(apart).sum(-1).mean()))
 
 

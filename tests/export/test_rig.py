@@ -13,9 +13,9 @@ from snarfcli.export.rig import (
     decompose,
     local_frames,
     recompose,
-    skin_vertices,
     unique_names,
 )
+from snarfcli.meshing.skinned import skin_vertices
 
 TOY = ToyCharacter()
 PARENTS = TOY.skeleton.parents
@@ -80,7 +80,7 @@ def test_skinning_is_the_avatars():
     points = torch.from_numpy(vertices)
     transforms = clip_transforms(TOY.skeleton, Clip(motion))[2]
     wanted = TOY.skin(points, torch.from_numpy(transforms).float())
-    found = skin_vertices(vertices, transforms, TOY.skinning_weights(points).numpy())
+    found = skin_vertices(vertices, TOY.skinning_weights(points).numpy(), transforms)
     np.testing.assert_allclose(found, wanted, atol=2e-6)
 
 

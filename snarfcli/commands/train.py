@@ -19,7 +19,8 @@ from snarfcli.datasets.store import SampleStore, samples_folder
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
-from snarfcli.models.avatar import SYSTEMS, Avatar, load_checkpoint
+from snarfcli.models.avatar import SYSTEMS, Avatar
+from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
 from snarfcli.models.settings import AvatarConfig, ModelConfig

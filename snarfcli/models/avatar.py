@@ -18,6 +18,7 @@ from snarfcli.errors import UserError
 from snarfcli.files import write_tensors
 from snarfcli.models.back_d import BackD
 from snarfcli.models.back_lbs import BackLBS
+from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.fast_snarf import FastSnarf
 from snarfcli.models.nasa import Nasa
 from snarfcli.models.piecewise import Piecewise
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from snarfcli.meshing.skinned import SkinnedSurface
     from snarfcli.motions import Motion
 
-__all__ = ["SYSTEMS", "Avatar", "load_checkpoint"]
+__all__ = ["SYSTEMS", "Avatar"]
 
 FORMAT = "snarf-avatar"
 FORMAT_VERSION = 1
@@ -313,26 +314,3 @@ def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | 
     if len(template.vertices) != len(template.weights):
         raise ValueError(f"template: {len(template.vertices)} vertices, but weights for {len(template.weights)}")
     return template
-
-
-def load_checkpoint(path: str | Path, file_format: str, version: int, what: str) -> dict[str, Any]:
-    """Read a dict written by `torch.save` without executing anything in it.
-
-    Raises:
-        UserError: the file is missing, damaged, of another kind or another version.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise UserError(f"no {what} at {path}; train one with \"snarf train\" or name another file")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError:
-        raise
-    except Exception:  # damaged bytes raise whatever the unpickler stumbles over: IndexError, UnicodeDecodeError, ...
-        raise UserError(f"{what} {path} is truncated or is not a file of snarf; train it again or copy it again") from None
-    if not isinstance(content, dict) or content.get("format") != file_format:
-        raise UserError(f"{path} is not a snarf {what}; give the file that \"snarf train\" wrote")
-    if content.get("version") != version:
-        came = content.get("version")
-        raise UserError(f"{what} {path} has format version {came}, this snarf reads {version}; train it again")
-    return content

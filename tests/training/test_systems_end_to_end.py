@@ -20,7 +20,8 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.store import SampleStore
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import SYSTEMS, Avatar, load_checkpoint
+from snarfcli.models.avatar import SYSTEMS, Avatar
+from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.settings import ModelConfig
 from snarfcli.shape import ConditionConfig
 from snarfcli.training import trainer as trainer_module

@@ -36,7 +36,7 @@ _PARTS = {
     "pose_jaw": ("jaw",),
     "pose_eye": ("l_eye", "r_eye"),
 }
-POSE_KEYS = (*_POSES, *_TRANSLATIONS, "smpl_scaling", *_FRAME_RATES, *_PARTS, "gender")
+POSE_KEYS = (*_POSES, *_TRANSLATIONS, "smpl_scaling", *_FRAME_RATES, *_PARTS, "up", "gender")
 """Names of all arrays that are looked at; gender is not used, but pickled objects in its place are refused."""
 # Axis-angle of a joint stays below pi, and below twice that if somebody unrolled it. In degrees some joint of a body is
 # further from straight than these 12.6 in nearly every frame. The root is left out: dancers turn and turn.
@@ -52,11 +52,11 @@ def motion_from_arrays(
 
     Args:
         arrays: `poses` (T, 3 K), (T, K, 3) or rotation matrices (T, K, 3, 3), or AMASS's parts `root_orient`, `pose_body`
-            and so on; optional: a translation, `smpl_scaling` that divides it, a frame rate, all under the usual names.
+            and so on; optional: a translation, `smpl_scaling` that divides it, a frame rate, all under the usual names; `up`, the text y or z.
         skeleton: whose poses are wanted.
         path: file they come from, for messages.
         name: what the motion is called.
-        up: which way is up in the file.
+        up: which way is up in the file; `auto` believes the file's own `up` where it has one.
         hands: what SMPL's hand joints do where the file has fingers: `rest` or `released`.
 
     Raises:
@@ -81,6 +81,8 @@ def motion_from_arrays(
     if up == "auto":
         if is_amass and layout_of(skeleton) is not None:
             up = "z"
+        elif str(arrays["up"] if "up" in arrays else "") in ("y", "z"):
+            up = str(arrays["up"])
         elif "smpl_poses" in arrays:  # AIST++'s world has y up, however its dancers lie
             up = "y"
         else:

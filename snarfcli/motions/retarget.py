@@ -101,7 +101,10 @@ def retarget(
         log.info("%s: without a counterpart, so they follow their parents: %s", path.name, ", ".join(left))
     parts = find_body_parts(skeleton.names, skeleton.parents)
     joints_rest = skeleton.joints_rest.detach().cpu().double().numpy()
-    rig = _straightened(rig, skeleton, pairs)
+    straightened = _straightened(rig, skeleton, pairs)
+    if up == "auto" and straightened is not rig and path.suffix.lower() in (".glb", ".gltf"):
+        up = "y"  # whoever wrote it knows this skeleton, and so the format; a body that lies would mislead the guess
+    rig = straightened
     match = RestMatch(
         pairs, parts.joints, parts.spine, joints_rest, rig.rest[:, :3, 3], skeleton.parents, rig.parents
     )

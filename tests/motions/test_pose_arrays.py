@@ -56,6 +56,21 @@ def test_72_values_with_a_translation_are_judged_by_how_the_body_stands(tmp_path
     np.testing.assert_array_equal(back.translation, ours.translation)
 
 
+@pytest.mark.parametrize("turn", [0.9, np.pi / 2])
+def test_a_file_may_say_which_way_is_up(tmp_path, turn):
+    """A body that leans or lies would mislead the guess."""
+    poses = np.zeros((1, 72))
+    poses[0, 0] = turn
+    arrays = {"poses": poses, "trans": np.array([[0, 0.5, 0]]), "fps": 30.0}
+    motion = read_motion(save(tmp_path, **arrays, up=np.array("y")))
+    np.testing.assert_array_equal(motion.poses[0, 0], [turn, 0, 0])
+    np.testing.assert_array_equal(motion.translation, [[0, 0.5, 0]])
+    turned = read_motion(save(tmp_path, **arrays, up=np.array("z")))
+    np.testing.assert_allclose(turned.poses[0, 0], [turn - np.pi / 2, 0, 0], atol=1e-12)
+    with_nonsense = read_motion(save(tmp_path, **arrays, up=np.array("sideways")), up="y")
+    np.testing.assert_array_equal(with_nonsense.poses[0, 0], [turn, 0, 0])
+
+
 @pytest.mark.parametrize("gender", [np.array("male"), np.array(b"female"), np.bytes_("neutral"), "male", np.array(["x"])])
 def test_gender_may_be_anything(tmp_path, gender):
     assert read_motion(save(tmp_path, **{**amass_arrays(), "gender": gender})).num_frames == 4

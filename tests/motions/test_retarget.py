@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from snarfcli.motions.retarget import choose_clip, retarget
 
 STANDING = builtin_motion("jumping_jacks", 3, duration_s=0.5)
 EXTREME = builtin_motion("deep_squats", 1, duration_s=0.5)
+LYING = builtin_motion("bridges", 0, duration_s=0.5)
 FEW = 1e-6  # metres; angles written to 1e-9 degrees, measured worst 4e-8
 
 
@@ -50,7 +52,7 @@ def test_the_skeletons_own_rig_gives_its_poses_back(tmp_path, motion):
 
 
 @pytest.mark.parametrize("scale", [1.0, 100.0])
-@pytest.mark.parametrize("motion", [STANDING, EXTREME], ids=lambda motion: motion.name)
+@pytest.mark.parametrize("motion", [STANDING, EXTREME, LYING], ids=lambda motion: motion.name)
 def test_its_own_rig_may_rest_in_another_pose(motion, scale):
     """Exported avatars rest with their legs apart; feet must not be taken to be turned for that."""
     skeleton = replace(smpl(), canonical_pose=legs_apart_pose(SMPL_JOINT_NAMES, torch.float64))
@@ -63,7 +65,7 @@ def test_its_own_rig_may_rest_in_another_pose(motion, scale):
     at = np.tile(np.eye(4), (len(motion.poses) + 1, 24, 1, 1))
     at[:, :, :3, :3], at[:, :, :3, 3] = frames[1][:, :, :3, :3], scale * frames[0].numpy()
     rig = Rig(SMPL_JOINT_NAMES, PARENTS, at[0], (Clip("own", motion.frame_rate, at[1:]),))
-    back = retarget(rig, rig.clips[0], skeleton, path="own.glb", name="own", up="y")
+    back = retarget(rig, rig.clips[0], skeleton, path=Path("own.glb"), name="own")
     difference = Rotation.from_rotvec(back.poses.reshape(-1, 3)).inv() * Rotation.from_rotvec(motion.poses.reshape(-1, 3))
     assert difference.magnitude().max() < 1e-6
     np.testing.assert_allclose(back.translation, motion.translation, atol=1e-6)

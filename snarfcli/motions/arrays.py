@@ -52,7 +52,8 @@ def motion_from_arrays(
 
     Args:
         arrays: `poses` (T, 3 K), (T, K, 3) or rotation matrices (T, K, 3, 3), or AMASS's parts `root_orient`, `pose_body`
-            and so on; optional: a translation, `smpl_scaling` that divides it, a frame rate, all under the usual names; `up`, the text y or z.
+            and so on; optional: a translation, `smpl_scaling` that divides it, a frame rate, all under the usual names; `up`,
+            the text y or z.
         skeleton: whose poses are wanted.
         path: file they come from, for messages.
         name: what the motion is called.
@@ -79,10 +80,11 @@ def motion_from_arrays(
             raise UserError(f"pose file {path}: {key} leads over {_LARGEST_WAY_M / 1000:g} km away; wanted metres")
     frame_rate = _frame_rate(arrays, path)
     if up == "auto":
-        if is_amass and layout_of(skeleton) is not None:
+        said = str(arrays.get("up", ""))
+        if said in ("y", "z"):
+            up = said
+        elif is_amass and layout_of(skeleton) is not None:
             up = "z"
-        elif str(arrays["up"] if "up" in arrays else "") in ("y", "z"):
-            up = str(arrays["up"])
         elif "smpl_poses" in arrays:  # AIST++'s world has y up, however its dancers lie
             up = "y"
         else:

@@ -37,8 +37,8 @@ class Player:
         return int(position + 1e-9)
 
     def play(self, now: float) -> None:
-        """Run from the present frame; from the first one if this is the end."""
-        if self.num_frames == 0 or self.is_playing:
+        """Run from the present frame; from the first one if this is the end. A single frame does not run."""
+        if self.num_frames < 2 or self.is_playing:
             return
         if not self.is_looping and self._position >= self.num_frames - 1:
             self._position = 0.0
@@ -71,7 +71,7 @@ class Player:
 
     def _at(self, now: float) -> float:
         """Return the position in frames, within the motion."""
-        if not self.is_playing or self.num_frames == 0:
+        if not self.is_playing:
             return self._position
         position = self._position + (now - self._since) * self.frame_rate * self.speed
         return position % self.num_frames if self.is_looping else min(position, float(self.num_frames - 1))

@@ -55,6 +55,6 @@ def test_nothing_to_play():
     player = Player()
     player.play(0.0)
     assert not player.is_playing and player.frame(5.0) == 0 and player.seconds_to_next(5.0) is None
-    player.load(1, 30.0)
+    player.load(1, 30.0)  # a pose
     player.play(0.0)
-    assert player.frame(9.0) == 0
+    assert not player.is_playing and player.frame(9.0) == 0 and player.seconds_to_next(9.0) is None

@@ -26,12 +26,13 @@ def load_motion(name: str):
         raise UserError("no such\nmotion")
     poses = np.zeros((4, 2, 3))
     poses[:, 1, 2] = np.linspace(0, 0.9, 4)
-    return Motion(name, poses, np.zeros((4, 3)), 20.0), None
+    motion = Motion(name, poses, np.zeros((4, 3)), 20.0)
+    return (motion.slice(3) if name == "pose" else motion), None
 
 
 @pytest.fixture
 def server():
-    server = ViewServer(ToyAvatar(), SMALL, motions=["bend", "broken"], load_motion=load_motion, facts=FACTS)
+    server = ViewServer(ToyAvatar(), SMALL, motions=["bend", "pose", "broken"], load_motion=load_motion, facts=FACTS)
     yield server
     server.stop()
 
@@ -86,6 +87,15 @@ def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(server):
         page.change("Motion", "none")
         page.change("turn z", 10.0)
         page.until_node("/avatar/plain", "vertices")
+
+
+def test_the_sliders_show_a_motion_of_one_frame(server):
+    with Page(server.server) as page:
+        page.until_text("vertices")
+        page.change("Motion", "pose")
+        turn = page.uuid("turn z")
+        page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == pytest.approx(51.6))
+        assert not server.viewing.player.is_playing
 
 
 def test_every_look(server):

@@ -240,6 +240,8 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
     """
     out: list[str] = []
     flags: list[str] = []
+    given: set[str] = set()
+    written: set[str] = set()
     collected: dict[str, list[str]] = {}
     rest = list(arguments)
     if command.positional and rest and "=" not in rest[0] and not rest[0].startswith(("-", "~")):
@@ -256,10 +258,14 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
                     value = rest.pop(0)
                 if "[{}]" in override:
                     collected.setdefault(override, []).append(quote(value))
+                    given.add(name)
                     continue
                 override = override.format(quote(value))
             elif equals:
                 raise UserError(f"{name} takes no value, got {argument!r}")
+            if name in given and "{}" in command.flags[name]:
+                raise UserError(f"{name} can be given once, got it twice; leave one out")
+            given.add(name)
             out.append(override)
         elif name in _HYDRA_FLAGS:
             flags.append(argument)
@@ -271,7 +277,12 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
         elif not equals or argument.startswith("~"):
             raise UserError(f"{argument!r} is no setting; write name=value; see \"snarf {command.name} --help\"")
         else:
+            written.add(name)
             out.append(f"{name}={quote_items(value)}" if name in command.lists_of_settings else argument)
+    for name in sorted(given):
+        setting = command.flags[name].partition("=")[0]
+        if setting in written:
+            raise UserError(f"{name} and {setting}=... say the same thing; give one of them")
     out += [override.format(",".join(values)) for override, values in collected.items()]
     return out + flags
 

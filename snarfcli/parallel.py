@@ -20,6 +20,7 @@ from snarfcli.errors import UserError
 
 __all__ = ["Worker", "count_cores", "interrupts_held_back", "run_in_processes"]
 
+_PATIENCE_S = 10.0  # for a process that was told to end; writing a large mesh takes a second
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 
 
@@ -75,9 +76,12 @@ class Worker:
 
     def end(self) -> None:
         """End the process, whatever it is doing; nothing is left of it afterwards."""
+        self.receiver.close()  # first: a process that waits for somebody to receive goes on then, to its end
         self._process.terminate()
-        self._process.join()
-        self.receiver.close()
+        self._process.join(_PATIENCE_S)
+        if self._process.is_alive():  # Python heard the signal where it passes over exceptions, or hangs in native code
+            self._process.kill()
+            self._process.join()
 
 
 def run_in_processes(

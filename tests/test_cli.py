@@ -58,6 +58,10 @@ def test_configuration_is_complete_and_typed(capsys, name):
 
 
 WRONG = {
+    ("animate", "--pose", "a.npz", "--pose=b.npz"): "--pose can be given once, got it twice",
+    ("animate", "--pose", "a.npz", "pose=b.npz"): "--pose and pose=... say the same thing",
+    ("export", "pose=[b.npz]", "--pose", "a.npz"): "--pose and pose=... say the same thing",
+    ("eval", "--ood", "split=id"): "--ood and split=... say the same thing",
     ("trian",): "unknown command 'trian'; did you mean 'train'?",
     ("train", "subjct=1"): "unknown setting 'subjct'; did you mean 'subject'?",
     ("train", "training.step=3"): "unknown setting 'training.step'; did you mean 'training.steps'?",

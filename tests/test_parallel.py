@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator
 
 import pytest
 
 from snarfcli.errors import UserError
-from snarfcli.parallel import run_in_processes
+from snarfcli.parallel import Worker, run_in_processes
 
 
 def _count(start: int, stop: int) -> Iterator[tuple[int, int]]:
@@ -31,6 +32,20 @@ def _fail(kind: str) -> Iterator[int]:
 def _forever() -> Iterator[int]:
     while True:
         yield 0
+
+
+def _deaf() -> Iterator[bytes]:
+    """Passes over the signal that should end it, as happens where Python ignores exceptions, and fills the pipe."""
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    while True:
+        yield bytes(1 << 20)
+
+
+def test_a_process_that_is_deaf_to_signals_ends_too() -> None:
+    worker = Worker(_deaf, ())
+    assert worker.receive()[0]
+    worker.end()
+    assert not multiprocessing.active_children()
 
 
 def test_every_task_has_a_process_of_its_own_and_keeps_its_order() -> None:

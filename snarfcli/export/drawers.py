@@ -54,9 +54,9 @@ class Drawer:
 
     def end(self) -> None:
         """End the process; nothing is left of it afterwards."""
+        self._line.close()  # whoever waits for a frame, or to hand one over, goes on then, to its end
         self._process.terminate()
         self._process.join()
-        self._line.close()
 
     def _lost(self) -> UserError:
         self._process.join()

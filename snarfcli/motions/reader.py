@@ -56,8 +56,8 @@ def read_motion(
         skeleton: whose poses are wanted; SMPL's 24 joints by default. Arrays are carried over between SMPL, SMPL-H and SMPL-X
             joint by joint: hands and face where both have them, straight otherwise. A skeleton of another kind takes 3 values a
             joint as they are. Poses of rigs are retargeted: bone directions and the height of the hips decide.
-        up: which way is up in the file. `auto`: what arrays say by `up` ("y" or "z"), else z for AMASS's, y for AIST++, y for other
-            arrays without a translation, and the axis along which the body stands for those with one and for rigs. A glTF
+        up: which way is up in the file. `auto`: what arrays say by `up` ("y" or "z"), else z for AMASS's, y for AIST++, y for
+            other arrays without a translation, and the axis along which the body stands for those with one and for rigs. A glTF
             file of the skeleton itself has y up, as the format says.
         hands: what SMPL's two hand joints do where an array has fingers in their place: `rest`, straight, or `released`,
             values 66 to 72, as in the training data of the released code.

@@ -100,9 +100,12 @@ def posed_joints(skeleton: Skeleton, transforms: NDArray[np.float32]) -> NDArray
 
 
 def pose_file(pose: NDArray[np.float64], translation: NDArray[np.float64]) -> bytes:
-    """Return one pose [J, 3] and its translation [3] as an .npz file that `--pose` reads, y up."""
+    """Return one pose [J, 3] and its translation [3] as an .npz file that `--pose` reads, y up.
+
+    The file says so, since a reader would take the axis along which the body stands for the one that is up: here it may lie.
+    """
     buffer = io.BytesIO()
-    np.savez(buffer, poses=pose.reshape(1, -1), trans=translation.reshape(1, 3), mocap_framerate=30.0)
+    np.savez(buffer, poses=pose.reshape(1, -1), trans=translation.reshape(1, 3), mocap_framerate=30.0, up=np.array("y"))
     return buffer.getvalue()
 
 

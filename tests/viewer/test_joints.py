@@ -91,3 +91,14 @@ def test_a_saved_pose_is_read_again(person, tmp_path):
     motion = read_motion(path, person, up="y")
     np.testing.assert_allclose(motion.poses[0], pose, atol=1e-6)
     np.testing.assert_allclose(motion.translation, [(0.1, 1.0, -0.3)], atol=1e-6)
+
+
+@pytest.mark.parametrize("lean", [0.9, np.pi / 2])
+def test_a_saved_pose_that_leans_or_lies_is_read_again_as_it_is(person, tmp_path, lean):
+    pose = np.zeros((24, 3))
+    pose[0, 0], pose[18] = lean, (0, 0, 1)
+    path = tmp_path / "pose.npz"
+    path.write_bytes(pose_file(pose, np.array([0, 0.5, 0])))
+    motion = read_motion(path, person)  # up=auto, as the commands have it
+    np.testing.assert_allclose(motion.poses[0], pose, atol=1e-6)
+    np.testing.assert_allclose(motion.translation, [(0, 0.5, 0)], atol=1e-6)

@@ -16,6 +16,7 @@ from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.choices import AvatarChoice, MotionChoice, check_motion_choice, choose_motion, load_chosen_avatar
 from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
+from snarfcli.export.rig import unique_names
 from snarfcli.models.avatar import Avatar
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL, layout_of
@@ -125,10 +126,9 @@ class _Shelf:
         self._config = config
         self._skeleton = avatar.skeleton
         self._loaded: dict[str, tuple[Any, Any]] = {}
-        for path in config.pose:
+        for name, path in zip(_file_names(config.pose), config.pose, strict=True):
             chosen = choose_motion(config, config, self._skeleton, path, None)
-            name = f"file: {Path(path).name}"
-            self._loaded[f"file: {path}" if name in self._loaded else name] = chosen.motion, chosen.bone_transforms
+            self._loaded[name] = chosen.motion, chosen.bone_transforms
         self.names: list[str] = [*self._loaded, *_own_motions(config, avatar)]
         first = next(iter(self._loaded), config.motion)
         self.first: tuple[str, Any, Any] | None = None if first is None else (first, *self.load(first))
@@ -142,6 +142,14 @@ class _Shelf:
             chosen = choose_motion(self._config, self._config, self._skeleton, None, name)
             self._loaded[name] = chosen.motion, chosen.bone_transforms
         return self._loaded[name]
+
+
+def _file_names(paths: list[str]) -> list[str]:
+    """Return what files are called on the page, each otherwise: by their paths where the last parts are the same."""
+    short = [Path(path).name for path in paths]
+    return unique_names([
+        f"file: {name if name and short.count(name) == 1 else path}" for name, path in zip(short, paths, strict=True)
+    ])  # fmt: skip
 
 
 def _own_motions(config: ViewConfig, avatar: Avatar) -> list[str]:

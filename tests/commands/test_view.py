@@ -144,6 +144,16 @@ def test_pose_files_are_on_the_shelf_and_the_first_one_plays(served):
     assert server.viewing.motion.num_frames == 4
 
 
+def test_no_pose_file_hides_another_one(served):
+    files = [pose_file("other/wave.npz", 4), pose_file("wave.npz"), "wave.npz"]
+    server = served(pose=files)
+    names = ("file: other/wave.npz", "file: wave.npz", "file: wave.npz_2")
+    assert server.controls._motion.options == ("none", *names)
+    assert server.viewing.motion.num_frames == 4
+    server.controls._choose_motion(names[1], None)
+    assert server.viewing.motion.num_frames == 3
+
+
 def test_sequences_of_the_samples_are_on_the_shelf(served, config, toy, monkeypatch):
     skeleton = SimpleNamespace(names=toy.skeleton.names, parents=toy.skeleton.parents)
     store = SimpleNamespace(skeleton=skeleton, all_sequences=[SimpleNamespace(name="trot"), SimpleNamespace(name="sit")])

@@ -145,21 +145,27 @@ def character_surface(avatar: Avatar, options: CharacterOptions) -> SkinnedSurfa
     """Return the avatar's skinned surface with at most the triangles that are wanted.
 
     Raises:
-        UserError: the avatar has no skinning weights, or so few triangles cannot be.
-        EmptySurface, FullSurface: the canonical field has no surface.
+        UserError: the avatar has no skinning weights or no surface, or so few triangles cannot be.
     """
     from snarfcli.meshing.skinned import SkinnedSurface
 
     check_avatar(avatar)
-    surface = avatar.skinned_surface(options.resolution)
-    if options.triangles is None or len(surface.mesh.faces) <= options.triangles:
-        return surface
-    log.info("decimating %d triangles to %d", len(surface.mesh.faces), options.triangles)
     try:
-        mesh = decimate(surface.mesh, options.triangles)
+        surface = avatar.skinned_surface(options.resolution)
+        if options.triangles is None or len(surface.mesh.faces) <= options.triangles:
+            return surface
+        log.info("decimating %d triangles to %d", len(surface.mesh.faces), options.triangles)
+        return SkinnedSurface(avatar, options.resolution, mesh=_decimated(surface.mesh, options.triangles))
+    except (EmptySurface, FullSurface) as error:
+        raise UserError(f"this avatar has no surface to export: {error}; train it longer, or give another by ckpt=FILE") from None
+
+
+def _decimated(mesh: Mesh, triangles: int) -> Mesh:
+    """Return the mesh with fewer triangles; what is wrong with so few is the user's to hear."""
+    try:
+        return decimate(mesh, triangles)
     except ValueError as error:
         raise UserError(str(error)) from None
-    return SkinnedSurface(avatar, options.resolution, mesh=mesh)
 
 
 def build_character(avatar: Avatar, surface: SkinnedSurface, clips: Sequence[Clip], options: CharacterOptions) -> Character:

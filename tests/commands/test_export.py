@@ -196,6 +196,16 @@ def test_what_a_user_can_get_wrong(folder, capsys, arguments, message):
     assert not (folder / "export").exists()
 
 
+@pytest.mark.parametrize("logit", [-1.0, 1.0])
+@pytest.mark.parametrize("suffix", ["glb", "ply"])
+def test_an_avatar_without_surface_is_a_line(folder, capsys, monkeypatch, logit, suffix):
+    monkeypatch.setattr(ToyCharacter, "canonical_logits", lambda self, points, pose: torch.full((len(points),), logit))
+    code, err = export(capsys, "--pose", pose_file("walk.npz"), f"format={suffix}")
+    assert code == 2 and len(err.splitlines()) == 1
+    assert "this avatar has no surface to export: the field is" in err and "train it longer" in err
+    assert not (folder / "export").exists()
+
+
 def test_an_avatar_without_weights_is_refused(folder, toy, capsys, monkeypatch):
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
     code, err = export(capsys, "--pose", pose_file("walk.npz"))

@@ -60,6 +60,10 @@ class ShownMesh:
 class Picture:
     """All that is to be seen at one moment."""
 
+    look: Look
+    """How it is to be shown: the look that the rest was made for, while the one that is wanted may have changed since."""
+    floor_y: float
+    """Height of the floor, metres."""
     posed: Posed
     """The pose that is wanted."""
     mesh: ShownMesh | None

@@ -79,17 +79,16 @@ class Scene:
 
     def show(self, picture: Picture) -> None:
         """Bring the stage up to date."""
-        look = self._viewing.look
         with self._server.atomic():
-            self._floor.position = (0.0, self._viewing.floor_y, 0.0)
+            self._floor.position = (0.0, picture.floor_y, 0.0)
             mesh = picture.mesh
             made = () if mesh is None else (mesh.posed.number, mesh.surface, mesh.seconds, id(mesh.faces))
-            key = (*made, look, self.body_color, self.is_wireframe)
+            key = (*made, picture.look, self.body_color, self.is_wireframe)
             if key != self._shown:
                 self._shown = key
                 self._show_surfaces(picture)
             self.advance()
-            self._show_skeleton(self._body.seen or picture.shown)
+            self._show_skeleton(self._body.seen or picture.shown, picture.look.shows_skeleton)
 
     def advance(self) -> float | None:
         """Go on with what takes its time; return for how many seconds there is nothing to do, None for for ever."""
@@ -99,7 +98,7 @@ class Scene:
 
     # ---------------------------------------------------------------- parts
     def _show_surfaces(self, picture: Picture) -> None:
-        look = self._viewing.look
+        look = picture.look
         opacity = _SEE_THROUGH if look.shows_skeleton else 1.0
         mesh = picture.mesh
         if mesh is None:
@@ -115,13 +114,12 @@ class Scene:
             weights = mesh_c.weights if look.weight_colors else None
             self._canonical.show(mesh_c.vertices, mesh_c.faces, weights, self.body_color, 1.0, self.is_wireframe)
             low = float(mesh_c.vertices[:, 1].min())
-            self._canonical.place((-self._aside, self._viewing.floor_y - low, 0.0))
-            top = self._viewing.floor_y + float(np.ptp(mesh_c.vertices[:, 1])) + 0.06 * self.size
+            self._canonical.place((-self._aside, picture.floor_y - low, 0.0))
+            top = picture.floor_y + float(np.ptp(mesh_c.vertices[:, 1])) + 0.06 * self.size
             self._label.position = (-self._aside, top, 0.0)
         self._label.visible = mesh_c is not None
 
-    def _show_skeleton(self, shown: Posed) -> None:
-        shows = self._viewing.look.shows_skeleton
+    def _show_skeleton(self, shown: Posed, shows: bool) -> None:
         if not shows and self._joints is None:
             return
         joints = posed_joints(self._skeleton, shown.transforms)

@@ -173,6 +173,8 @@ class Viewing:
             if request is not None and is_due and self._worker.start(request):
                 self._next_shape = now + _SHAPE_EVERY_S
             picture = Picture(
+                look,
+                self.floor_y,
                 posed,
                 self._made.shown(posed, look, self.player.is_playing),
                 self._made.canonical(look) if look.shows_canonical else None,

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from omegaconf import MISSING
 
 from snarfcli.checks import check_choice, check_number
@@ -125,7 +124,7 @@ def run(config: AnimateConfig) -> int:
     log.info("motion: %s, %d frames at %g a second", motion.name, motion.num_frames, motion.frame_rate)
 
     start = time.perf_counter()
-    canonical = _canonical(config, avatar, motion)
+    canonical = _canonical(config, avatar)
     animation = Animation(
         avatar,
         motion.name,
@@ -256,16 +255,15 @@ def _check_system(config: AnimateConfig, avatar: Avatar) -> None:
         )
 
 
-def _canonical(config: AnimateConfig, avatar: Avatar, motion: Motion) -> Mesh | None:
+def _canonical(config: AnimateConfig, avatar: Avatar) -> Mesh | None:
     """Return a canonical mesh of the body, for colours and cameras; None without need or if there is none."""
     if not (config.video or config.weight_colors) or not avatar.has_skinning_weights:
         return None
     try:
-        if config.surface == "skinned" or {"skinned", "canonical", "weights"} & set(config.beside):
+        if config.weight_colors or config.surface == "skinned" or {"skinned", "canonical", "weights"} & set(config.beside):
             # Made here, the avatar remembers it, and takes it along to worker processes.
             return avatar.skinned_surface(config.resolution, config.keep_share).mesh
-        resolution = min(128, config.resolution) if config.weight_colors else min(64, config.resolution)
-        return canonical_surface(avatar, torch.from_numpy(motion.poses[0]).float(), resolution)
+        return canonical_surface(avatar, avatar.skeleton.canonical_pose.float(), min(64, config.resolution))
     except (EmptySurface, FullSurface):
         return None
 
@@ -283,6 +281,7 @@ def _record(
         "poster": POSTER if config.video else None,
         "frames": [asdict(frame) for frame in frames],
         "skipped": [{"frame": frame.frame, "reason": frame.problem} for frame in frames if frame.problem],
+        "missing": [{"frame": frame.frame, "reason": text} for frame in frames for text in frame.missing],
         "timings": {
             "total_s": round(seconds, 3),
             "extraction_s": round(sum(frame.extraction_s for frame in frames), 3),
@@ -312,4 +311,7 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
         log.info("%d frames have loose pieces; keep_share=0.1 would drop all but large ones", pieces)
     if skipped:
         log.warning("%d of %d frames have no surface; see %s", skipped, len(frames), folder / RECORD)
-    return 1 if skipped else 0
+    incomplete = sum(bool(frame.missing) for frame in frames)
+    if incomplete:
+        log.warning("%d of %d frames lack something beside the avatar; see %s", incomplete, len(frames), folder / RECORD)
+    return 1 if skipped or incomplete else 0

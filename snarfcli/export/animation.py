@@ -69,6 +69,8 @@ class FrameRecord:
     """Whether the mesh was there already and was kept."""
     problem: str | None = None
     """Why there is no surface."""
+    missing: list[str] = field(default_factory=list)
+    """What could not be shown beside it, and why."""
 
 
 @dataclass
@@ -132,6 +134,8 @@ class Animation:
             for _, (frame, picture) in shown:
                 if frame.problem:
                     log.warning("frame %d: %s", frame.frame, frame.problem)
+                for text in frame.missing:
+                    log.warning("frame %d, beside: %s", frame.frame, text)
                 if frame.is_capped:
                     log.warning("frame %d: the surface reaches the border of its box and was closed there", frame.frame)
                 self.frames.append(frame)
@@ -199,9 +203,10 @@ class Animation:
             if content == "canonical":
                 mesh = self._canonical(index)
             else:
-                mesh = self._posed(index, "field" if content == "field" else "skinned")
+                lender = self.weights_from if self.weight_colors else None
+                mesh = self._posed(index, "field" if content == "field" else "skinned", lender)
         except (EmptySurface, FullSurface) as error:
-            frame.problem = frame.problem or f"{CONTENTS[content]}: {error}"
+            frame.missing.append(f"{CONTENTS[content]}: {error}")
             return None
         return _colored(mesh) if content == "weights" or self.weight_colors else mesh
 

@@ -33,8 +33,6 @@ SURFACES = ("field", "skinned")
 # Logits beyond this say no more than occupied or not, but would pull vertices onto lattice nodes: a point without a
 # correspondence has a very negative one.
 _LARGEST_LOGIT = 10.0
-# Voxel of a skinned surface's canonical mesh and of the mesh that lends its weights, cells along the longest side.
-_WEIGHTS_RESOLUTION = 128
 _NEIGHBOURS = 8
 # Cells around the surface that are split beyond need. Bodies are of one piece: without any, 40 meshes of two avatars came out
 # the same, from 12 % fewer evaluations.
@@ -107,7 +105,7 @@ def field_surface(
 def canonical_surface(
     avatar: AvatarLike,
     pose: Tensor,
-    resolution: int = _WEIGHTS_RESOLUTION,
+    resolution: int = 128,
     *,
     keep_share: float = 0.01,
     chunk: int = 65536,

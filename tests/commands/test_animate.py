@@ -20,6 +20,7 @@ from snarfcli.commands.animate import AnimateConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.meshing.extract import EmptySurface
+from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.models.avatar import Avatar
 from snarfcli.motions import Motion
 
@@ -164,6 +165,28 @@ def test_views_and_contents_side_by_side(config):
     colors = [np.ptp(panel, axis=2).max() for panel, _ in panels]
     assert colors[3] > colors[0] + 40  # only the weights are coloured
     assert record_of(config)["poster"] == "poster.png"
+
+
+def test_meshes_do_not_depend_on_what_is_beside(config, tmp_path):
+    """Else a run that goes on with other panels would mix two kinds of colours."""
+    written = []
+    for beside in ([], ["weights"]):
+        folder = tmp_path / f"beside_{len(beside)}"
+        assert run(replace(config, max_frames=2, weight_colors=True, beside=beside, output=str(folder))) == 0
+        written.append((folder / "frame_000001.ply").read_bytes())
+    assert written[0] == written[1]
+
+
+def test_what_is_missing_beside_is_no_missing_frame(config, toy, monkeypatch, caplog):
+    def posed(self, *arguments, **keywords):
+        raise EmptySurface("nothing there")
+
+    monkeypatch.setattr(SkinnedSurface, "posed", posed)
+    assert run(replace(config, max_frames=2, beside=["skinned"])) == 1
+    record = record_of(config)
+    assert record["skipped"] == [] and [frame["file"] for frame in record["frames"]] == ["frame_000000.ply", "frame_000001.ply"]
+    assert [entry["reason"] for entry in record["missing"]] == ["skinned surface: nothing there"] * 2
+    assert "2 of 2 frames lack something beside the avatar" in caplog.text
 
 
 def test_truth_is_shown_where_there_is_some(config, toy, tmp_path, monkeypatch):

@@ -27,6 +27,7 @@ inline bool valid(const snarf_network* network, const float* points, const float
   if (!network || !network->layers || network->layer_count < 1 || count < 0 || threads < 1) return false;
   if (count && (!points || !out || (network->extra_count && !extras))) return false;
   if (network->frequency_count < 0 || network->extra_count < 0 || network->segment_count < 0) return false;
+  if ((network->frequency_count && !network->frequencies) || (network->segment_count && !network->segments)) return false;
   int hidden = 0;
   for (int n = 0; n < network->layer_count; ++n) {
     const snarf_layer& layer = network->layers[n];

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from snarfcli.commands.animate_settings import AnimateConfig
+from snarfcli import names
 from snarfcli.commands.choices import ChosenMotion
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
-
-if TYPE_CHECKING:
-    from snarfcli.commands.animate import AnimateConfig
 
 __all__ = ["POSTER", "RECORD", "VIDEO", "folder_name", "frame_settings", "prepare_folder"]
 
@@ -23,7 +21,7 @@ POSTER = "poster.png"
 
 def folder_name(name: str) -> str:
     """Return a motion's name as a folder's."""
-    return re.sub(r"[^\w.+-]+", "_", name).strip(".") or "motion"
+    return names.folder_name(name, "motion")
 
 
 def frame_settings(config: AnimateConfig, avatar: Path, chosen: ChosenMotion) -> dict[str, Any]:

@@ -50,6 +50,7 @@ class Scene:
         self.shows_handle = False
         self.chosen_joint = 0
         self._shown: tuple | None = None
+        self._picture: Picture | None = None
         self._is_turning = False
         rest = viewing.body.transforms(np.zeros((self._skeleton.num_joints, 3)), np.zeros(3))
         joints = posed_joints(self._skeleton, rest)
@@ -81,11 +82,12 @@ class Scene:
         """Bring the stage up to date."""
         with self._server.atomic():
             self._floor.position = (0.0, picture.floor_y, 0.0)
-            mesh = picture.mesh
+            mesh, mesh_c = picture.mesh, picture.canonical
             made = () if mesh is None else (mesh.posed.number, mesh.surface, mesh.seconds, id(mesh.faces))
-            key = (*made, picture.look, self.body_color, self.is_wireframe)
+            beside = () if mesh_c is None else (id(mesh_c.vertices), id(mesh_c.faces), picture.floor_y)
+            key = (made, beside, picture.look, self.body_color, self.is_wireframe)
             if key != self._shown:
-                self._shown = key
+                self._shown, self._picture = key, picture  # held, so that no other array gets the numbers of its arrays
                 self._show_surfaces(picture)
             self.advance()
             self._show_skeleton(self._body.seen or picture.shown, picture.look.shows_skeleton)

@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import io
 
+import numpy as np
 import pytest
+from torch import Tensor
+from toy_avatar import RADIUS
 from toy_viewer import PATIENCE, Watched
 
+from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.scene import Scene
 
@@ -34,6 +38,11 @@ def scene(server, watched) -> Scene:
     return Scene(server, watched.viewing, lambda joint: None, lambda: watched.now)
 
 
+def grown_as_bent(surface: SkinnedSurface, pose: Tensor) -> np.ndarray:
+    """Canonical vertices of a shape that grows with the bend of joint 1."""
+    return surface.mesh.vertices * np.float32(1 + pose[1, 2])
+
+
 def show_settled(scene: Scene, watched: Watched) -> Picture:
     """Show all pictures until nothing more is being made, as the server does; return the last one."""
     while True:
@@ -57,3 +66,23 @@ def test_a_look_that_changes_between_picture_and_stage_is_not_lost(scene, watche
     show_settled(scene, watched)
     assert not scene._body._plain.visible and scene._joints.visible
     assert [node.visible for node in scene._body._colored if node is not None] == [True]
+
+
+def test_the_shape_beside_a_field_is_that_of_its_pose(scene, watched, monkeypatch):
+    monkeypatch.setattr(SkinnedSurface, "canonical_vertices", grown_as_bent)
+    watched.viewing.change_look(surface="field", shows_canonical=True)
+    show_settled(scene, watched)
+    for bend in (0.3, 0.6):
+        watched.viewing.turn_joint(1, np.array([0.0, 0.0, bend]))
+        picture = show_settled(scene, watched)
+        assert picture.mesh.surface == "field"
+        assert np.ptp(scene._canonical._plain.vertices[:, 1]) == pytest.approx((1 + bend) * 2 * RADIUS, abs=0.02)
+
+
+def test_the_shape_beside_stands_on_the_floor_wherever_that_is(scene, watched):
+    watched.viewing.change_look(has_pose_shape=False, shows_canonical=True)
+    show_settled(scene, watched)
+    watched.viewing.floor_y -= 0.5
+    show_settled(scene, watched)
+    feet = scene._canonical._plain.vertices[:, 1].min() + scene._canonical._frame.position[1]
+    assert feet == pytest.approx(watched.viewing.floor_y)

@@ -6,8 +6,8 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from snarfcli.commands.animate_settings import AnimateConfig
 from snarfcli import names
+from snarfcli.commands.animate_settings import AnimateConfig
 from snarfcli.commands.choices import ChosenMotion
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json

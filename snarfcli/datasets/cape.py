@@ -19,7 +19,6 @@ import torch
 
 from snarfcli.bodies import Body, find_body, load_body
 from snarfcli.datasets.cape_frames import CapeMeshes, read_cape_frame
-from snarfcli.datasets.recordings import folder_names
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import split_sequences
 from snarfcli.datasets.subjects import SequenceSpec, Split, SubjectData, body_template
@@ -27,6 +26,7 @@ from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_npy
 from snarfcli.formats.pickles import read_pickle
 from snarfcli.motions import Motion
+from snarfcli.names import folder_names
 from snarfcli.progress import progress
 
 __all__ = ["load", "subjects"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +15,7 @@ from snarfcli.datasets.skeleton_files import PoseFile
 from snarfcli.datasets.subjects import SequenceSpec, Split
 from snarfcli.motions import Motion
 
-__all__ = ["PERSON_M", "World", "Recording", "folder_names", "person_scale"]
+__all__ = ["PERSON_M", "World", "Recording", "person_scale"]
 
 PERSON_M = 1.8
 """Longest side that a subject is scaled to: the settings of training hold lengths that fit a person."""
@@ -126,21 +124,3 @@ def person_scale(vertices: NDArray, wanted: str, given: float | None) -> tuple[f
         return 1.0, f"not scaled: {length:.2f} m long"
     scale = PERSON_M / length
     return scale, f"scaled by {scale:.4g}, so that {length:.4g} units become {PERSON_M} m; data.scale=NUMBER sets it"
-
-
-def folder_names(names: Iterable[str]) -> list[str]:
-    """Return names that can be folders on any system, each once, whatever the letter case."""
-    made: list[str] = []
-    for name in names:
-        base = re.sub(r"[^\w.+-]+", "_", name).strip("._") or "clip"
-        base = name = base[:80]
-        number = 1
-        while name.lower() in _lower(made):
-            number += 1
-            name = f"{base}_{number}"
-        made.append(name)
-    return made
-
-
-def _lower(names: Sequence[str]) -> set[str]:
-    return {name.lower() for name in names}

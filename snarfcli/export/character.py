@@ -157,7 +157,7 @@ def character_surface(avatar: Avatar, options: CharacterOptions) -> SkinnedSurfa
         log.info("decimating %d triangles to %d", len(surface.mesh.faces), options.triangles)
         return SkinnedSurface(avatar, options.resolution, mesh=_decimated(surface.mesh, options.triangles))
     except (EmptySurface, FullSurface) as error:
-        raise UserError(f"this avatar has no surface to export: {error}; train it longer, or give another by ckpt=FILE") from None
+        raise UserError(f"this avatar has no surface to export: {error}; train it longer, or give another by ckpt=") from None
 
 
 def _decimated(mesh: Mesh, triangles: int) -> Mesh:

@@ -16,8 +16,9 @@ import torch
 
 from snarfcli.errors import UserError
 from snarfcli.export.meshes import MESH_WRITERS, weights_to_colors
-from snarfcli.export.rig import Clip, unique_names
+from snarfcli.export.rig import Clip
 from snarfcli.meshing.extract import EmptySurface, FullSurface
+from snarfcli.names import folder_names
 from snarfcli.progress import progress
 
 if TYPE_CHECKING:
@@ -78,9 +79,11 @@ def write_sequence(
     """
     skipped = []
     colors = weights_to_colors(surface.mesh.weights) if weight_colors else None
-    for name, clip in zip(unique_names([clip.motion.name for clip in clips]), clips, strict=True):
-        place = folder / re.sub(r"[^\w.+-]+", "_", name).strip(".") if len(clips) > 1 else folder
-        place.mkdir(exist_ok=True)
+    for name, clip in zip(folder_names(clip.motion.name for clip in clips), clips, strict=True):
+        place = folder
+        if len(clips) > 1:
+            place = folder / name
+            place.mkdir()
         motion = clip.motion
         for frame in progress(range(motion.num_frames), desc=f"export {name}", unit="frames"):
             pose, translation = (torch.from_numpy(part[frame]).float() for part in (motion.poses, motion.translation))

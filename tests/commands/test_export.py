@@ -113,6 +113,15 @@ def test_several_clips_of_meshes_have_a_folder_each(folder, capsys):
     assert found == [f"{clip}/frame_00000{frame}.ply" for clip in ("walk", "walk_2") for frame in range(2)]
 
 
+def test_clips_of_similar_names_have_a_folder_each_too(folder, capsys):
+    names = ["walk 1.npz", "walk_1.npz", "Walk_1.npz", "...npz"]
+    poses = [part for name in names for part in ("--pose", pose_file(name, 2))]
+    assert export(capsys, *poses, "format=obj", "output=out")[0] == 0
+    places = sorted(path.name for path in Path("out").iterdir() if path.is_dir())
+    assert places == ["Walk_1_3", "clip", "walk_1", "walk_1_2"]
+    assert [len(list((Path("out") / place).glob("*.obj"))) for place in places] == [2, 2, 2, 2]
+
+
 def test_an_existing_file_stays_until_overwrite(folder, capsys):
     arguments = ("--pose", pose_file("walk.npz", 2))
     path = folder / "export" / "50002.glb"

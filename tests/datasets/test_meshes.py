@@ -15,7 +15,7 @@ from toy_animal_files import animal_glb, write_animal_bvh, write_animal_meshes, 
 
 from snarfcli.datasets import meshes
 from snarfcli.datasets.preprocessing import preprocess_subject
-from snarfcli.datasets.recordings import World, folder_names
+from snarfcli.datasets.recordings import World
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.store import SampleStore
@@ -234,12 +234,6 @@ def test_one_sequence_may_lie_beside_the_skeleton(animal, tmp_path):
     for folder in (tmp_path, tmp_path / "rex"):  # the folder of subjects, or the subject's own
         assert meshes.subjects(request(folder)) == ("rex",)
         assert [spec.name for spec in meshes.load("rex", request(folder)).sequences] == ["rex", "rex_end"]
-
-
-def test_names_become_folders():
-    assert folder_names(["Armature|Walk", "walk/2", "WALK_2", "..", "", "a" * 200]) == [
-        "Armature_Walk", "walk_2", "WALK_2_2", "clip", "clip_2", "a" * 80,
-    ]  # fmt: skip
 
 
 def test_the_canonical_pose_is_the_files_or_the_rest(routes, animal, tmp_path):

@@ -86,8 +86,7 @@ def run(config: ExportConfig) -> int:
         _check_place(config, _place(config, run_folder(config.output_root, trained_on, config.subject, config.run)))
     avatar, path = load_chosen_avatar(config)
     check_avatar(avatar)
-    output = Path(config.output) if config.output else _place(config, path.parent)
-    _check_place(config, output)
+    output = _check_place(config, Path(config.output) if config.output else _place(config, path.parent))
     clips = _clips(config, avatar)
     if config.format == "usd" and len(clips) > 1:
         raise UserError(f"usd holds one timeline, got {len(clips)} motions; export them one by one, or give format=glb")
@@ -128,16 +127,16 @@ def _place(config: ExportConfig, folder: Path) -> Path:
     return folder / "export" / f"{config.subject}{joint}{config.format}"
 
 
-def _check_place(config: ExportConfig, output: Path) -> None:
-    """Refuse a place that is taken, or a name that says another format."""
+def _check_place(config: ExportConfig, output: Path) -> Path:
+    """Refuse a place that is taken, or a name that says another format; return it as it is written to."""
     if config.format in MESH_WRITERS:
-        check_folder(output, config.overwrite)
-        return
+        return check_folder(output, config.overwrite)
     suffix = output.suffix.lower().lstrip(".")
     if suffix != config.format:
         hint = f"give format={suffix}, or " if suffix in (*BLENDER_FORMATS, "glb") else ""
         raise UserError(f"output {output} should end in .{config.format}; {hint}give another name")
     check_output(output, config.overwrite)
+    return output
 
 
 def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:

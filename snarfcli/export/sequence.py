@@ -31,35 +31,60 @@ log = logging.getLogger(__name__)
 _OURS = re.compile(r"frame_\d{6}\.(ply|obj)|export\.json")
 
 
-def check_folder(folder: Path, overwrite: bool) -> None:
+def check_folder(folder: Path, overwrite: bool) -> Path:
     """Refuse a folder that holds something, unless it may be replaced and holds nothing but frames.
 
+    Returns:
+        The folder itself, links followed: it is replaced as a whole, and a link to it stays.
+
     Raises:
-        UserError: it must stay as it is.
+        UserError: it must stay as it is, or cannot be replaced.
     """
-    if folder.exists() and not folder.is_dir():
+    try:
+        place = folder.resolve()
+    except (OSError, RuntimeError) as error:  # links in a circle
+        raise UserError(f"{folder} cannot be followed ({error}); give output=FOLDER") from None
+    if place.exists() and not place.is_dir():
         raise UserError(f"{folder} is a file, not a folder; give output=FOLDER")
-    there = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
+    if place.is_dir() and (Path.cwd().is_relative_to(place) or place.is_mount()):
+        raise UserError(f"{folder} holds the current folder or is a disk, and is replaced as a whole; give output=FOLDER in it")
+    there = [path for path in place.rglob("*") if path.is_symlink() or not path.is_dir()] if place.is_dir() else []
     if there and not overwrite:
         raise UserError(f"{folder} holds {there[0].name} already; give overwrite=true to replace it, or output=FOLDER")
-    foreign = [path for path in there if not _OURS.fullmatch(path.name)]
+    foreign = [path for path in there if path.is_symlink() or not _OURS.fullmatch(path.name)]
     if foreign:
         raise UserError(f"{folder} holds {foreign[0].name}, which is no frame of an export; give output=FOLDER")
+    return place
 
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `folder` that takes its place when the block succeeds and vanishes when it fails."""
+    """Yield a temporary folder beside `folder` that takes its place when the block succeeds and vanishes when it fails.
+
+    Args:
+        folder: where to, see `check_folder`; what is there is moved aside first and deleted last.
+
+    Raises:
+        UserError: the place cannot be taken; what was there is still there, and the message says where the new files are.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.tmp")
+    token = secrets.token_hex(4)
+    temporary, aside = (folder.with_name(f".{folder.name}.{token}.{kind}") for kind in ("tmp", "old"))
     temporary.mkdir()
     try:
         yield temporary
-        if folder.exists():
-            shutil.rmtree(folder)
-        temporary.replace(folder)
-    finally:
+    except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    try:
+        if folder.exists():
+            folder.rename(aside)
+        temporary.rename(folder)
+    except OSError as error:
+        if aside.exists() and not folder.exists():
+            aside.rename(folder)
+        raise UserError(f"{folder} could not be replaced ({error.strerror}); the new files are in {temporary}") from None
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def write_sequence(

@@ -16,8 +16,10 @@ from toy_character import JOINTS, ToyCharacter, wave
 
 from snarfcli.cli import main
 from snarfcli.commands import choices
+from snarfcli.errors import UserError
 from snarfcli.export import blender
 from snarfcli.export.exporting import ExportReport
+from snarfcli.export.sequence import atomic_folder
 from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.skinned import SkinnedSurface
 
@@ -120,6 +122,54 @@ def test_clips_of_similar_names_have_a_folder_each_too(folder, capsys):
     places = sorted(path.name for path in Path("out").iterdir() if path.is_dir())
     assert places == ["Walk_1_3", "clip", "walk_1", "walk_1_2"]
     assert [len(list((Path("out") / place).glob("*.obj"))) for place in places] == [2, 2, 2, 2]
+
+
+def test_folders_that_cannot_be_replaced_are_refused_at_once(folder, toy, capsys, monkeypatch):
+    monkeypatch.setattr(toy, "skinned_surface", None)  # nothing is made
+    arguments = ("--pose", pose_file("walk.npz", 2), "format=ply", "overwrite=true")
+    Path("circle").symlink_to("circle")
+    Path("links").mkdir()
+    (Path("links") / "frame_000000.ply").symlink_to("nowhere")
+    for place, message in (
+        (".", ". holds the current folder or is a disk, and is replaced as a whole; give output=FOLDER in it"),
+        ("..", ".. holds the current folder"),
+        ("circle", "circle cannot be followed"),
+        ("links", "links holds frame_000000.ply, which is no frame of an export"),
+        ("walk.npz", "walk.npz is a file, not a folder"),
+    ):
+        code, err = export(capsys, *arguments, f"output={place}")
+        assert code == 2 and message in err and len(err.splitlines()) == 1, err
+    assert (Path("links") / "frame_000000.ply").is_symlink()
+
+
+def test_a_link_to_a_folder_stays_one(folder, capsys):
+    arguments = ("--pose", pose_file("walk.npz", 2), "format=ply", "output=link")
+    Path("link").symlink_to("real")
+    for more in ((), ("overwrite=true",)):
+        assert export(capsys, *arguments, *more)[0] == 0
+        assert Path("link").is_symlink()
+        assert sorted(path.name for path in Path("real").iterdir()) == ["export.json", "frame_000000.ply", "frame_000001.ply"]
+
+
+def test_new_frames_are_never_lost(tmp_path, monkeypatch):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "frame_000000.ply").write_text("old")
+    rename, renamed = Path.rename, []
+
+    def busy(self, target):
+        renamed.append(self)
+        if self.suffix == ".tmp":
+            raise OSError(16, "Device or resource busy")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", busy)
+    message = "could not be replaced .Device or resource busy.; the new files are in "
+    with pytest.raises(UserError, match=message) as caught, atomic_folder(folder) as temporary:
+        (temporary / "frame_000000.ply").write_text("new")
+    assert (folder / "frame_000000.ply").read_text() == "old"
+    assert (Path(str(caught.value).rpartition(" in ")[2]) / "frame_000000.ply").read_text() == "new"
+    assert renamed[0] == folder and len(list(tmp_path.iterdir())) == 2
 
 
 def test_an_existing_file_stays_until_overwrite(folder, capsys):

@@ -45,11 +45,12 @@ class MadeSurfaces:
         self._canonical: CanonicalMade | None = None
         self._shape: ShapeMade | None = None
         self._field: FieldMade | None = None
+        self._latest: type | None = None  # kind of what was done last
         self._failed: dict[tuple, str] = {}  # what could not be made, and why
 
     def keep(self, request: Any, made: Any, error: BaseException | None) -> bool:
         """Keep what was made, or why it was not; return whether it is the first canonical surface."""
-        is_first = False
+        is_first, self._latest = False, type(request)
         if error is not None:
             if not isinstance(error, EmptySurface | FullSurface):
                 log.error("the viewer goes on after: %s: %s", type(error).__name__, error, exc_info=error)
@@ -62,8 +63,8 @@ class MadeSurfaces:
             self._field = made
         return is_first
 
-    def wanted(self, posed: Posed, look: Look) -> MakeCanonical | MakeShape | MakeField | None:
-        """Return what has to be made next for a pose and a look; None if all is there, or cannot be made."""
+    def wanted(self, posed: Posed, look: Look) -> list[MakeCanonical | MakeShape | MakeField]:
+        """Return what has to be made for a pose and a look, what is more urgent first; empty if all is there, or cannot be."""
         requests: list[MakeCanonical | MakeShape | MakeField] = []
         has_canonical = self._canonical is not None and self._canonical.resolution == look.skinned_resolution
         if self._body.has_weights and not has_canonical:
@@ -75,10 +76,12 @@ class MadeSurfaces:
             made = self._shape
             if made is None or made.canonical is not self._canonical or made.posed.number != posed.number:
                 requests.append(MakeShape(posed, self._canonical))
+        if self._latest is MakeField:  # field and shape take turns, or a motion would never let the second one come
+            requests.sort(key=lambda request: isinstance(request, MakeField))
         # What failed is not tried again for the same pose, nor spoken of for another one.
         wanted = {_key(request) for request in requests}
         self._failed = {key: why for key, why in self._failed.items() if key in wanted}
-        return next((request for request in requests if _key(request) not in self._failed), None)
+        return [request for request in requests if _key(request) not in self._failed]
 
     @property
     def problem(self) -> str | None:

@@ -167,10 +167,11 @@ class Viewing:
             if outcome is not None and self._made.keep(*outcome):  # now it is known how far down the feet reach
                 self._find_floor()
             posed, look = self._posed, self.look
-            request = self._made.wanted(posed, look)
+            requests = self._made.wanted(posed, look)
             # the shape changes slowly: while playing, leave the processor to the browser in between
-            is_due = not (self.player.is_playing and isinstance(request, MakeShape)) or now >= self._next_shape
-            if request is not None and is_due and self._worker.start(request):
+            may_shape = not self.player.is_playing or now >= self._next_shape
+            due = next((request for request in requests if may_shape or not isinstance(request, MakeShape)), None)
+            if due is not None and self._worker.start(due) and isinstance(due, MakeShape):
                 self._next_shape = now + _SHAPE_EVERY_S
             picture = Picture(
                 look,
@@ -180,7 +181,7 @@ class Viewing:
                 self._made.canonical(look) if look.shows_canonical else None,
                 self._frame,
                 self.player.is_playing,
-                request is not None,
+                bool(requests),
                 self._made.problem,
             )
             return picture, self.player.seconds_to_next(now)

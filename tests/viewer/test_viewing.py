@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from toy_viewer import PATIENCE, SMALL, Watched
 
 from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.motions import Motion
+from snarfcli.viewer.body import MakeCanonical, MakeField, MakeShape
 
 BEND = np.array([0.0, 0.0, 0.9])
 
@@ -189,6 +192,39 @@ def test_a_field_while_playing_is_the_last_one_made(watched):
     assert picture.frame == 2 and picture.mesh.surface == "field" and picture.shown.number < picture.posed.number
     watched.viewing.pause()
     assert watched.settled().shown.number == picture.posed.number
+
+
+class AtOnce:
+    """A worker that is ready with each request before anybody asks again."""
+
+    def __init__(self, work: Callable[[Any], Any]) -> None:
+        self.kinds: list[type] = []
+        self._work, self._outcome = work, None
+
+    def start(self, request: Any) -> bool:
+        self.kinds.append(type(request))
+        self._outcome = request, self._work(request), None
+        return True
+
+    def take(self) -> tuple[Any, Any, None] | None:
+        outcome, self._outcome = self._outcome, None
+        return outcome
+
+
+def test_the_canonical_shape_follows_while_a_field_plays(watched, monkeypatch):
+    worker = AtOnce(watched.viewing.body.make)
+    with monkeypatch.context() as patch:
+        patch.setattr(watched.viewing, "_worker", worker)
+        watched.viewing.change_look(surface="field", shows_canonical=True)
+        for _ in range(4):
+            watched.picture()
+        assert worker.kinds == [MakeCanonical, MakeField, MakeShape]
+        watched.viewing.load_motion(bending(16, rate=40.0))
+        watched.viewing.play()
+        worker.kinds.clear()
+        for watched.now in 0.026 * np.arange(1, 9):  # a frame each; a tenth of a second at least between two shapes
+            watched.picture()
+        assert worker.kinds == [*[MakeField] * 3, MakeShape] * 2
 
 
 def test_over_one_spot(watched):

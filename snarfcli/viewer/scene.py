@@ -51,7 +51,7 @@ class Scene:
         self.chosen_joint = 0
         self._shown: tuple | None = None
         self._picture: Picture | None = None
-        self._is_turning = False
+        self._turning: set[int | None] = set()  # numbers of the clients that hold the handle
         rest = viewing.body.transforms(np.zeros((self._skeleton.num_joints, 3)), np.zeros(3))
         joints = posed_joints(self._skeleton, rest)
         self.size = float(max(np.ptp(joints, axis=0).max(), 0.1))
@@ -139,7 +139,7 @@ class Scene:
         self._joints.batched_colors = colors
         if self._bones is not None:
             self._bones.points = joints[np.array(self._skeleton.bones)]
-        if not self._is_turning:
+        if not self._turning:
             self._handle.position = joints[self.chosen_joint]
             turn = global_turns(self._skeleton, shown.transforms)[self.chosen_joint]
             self._handle.wxyz = turn.as_quat()[[3, 0, 1, 2]]
@@ -160,14 +160,18 @@ class Scene:
         self._handle = self._server.scene.add_transform_controls(
             "/handle", scale=0.13 * self.size, disable_axes=True, disable_sliders=True, depth_test=False, visible=False
         )
-        self._handle.on_update(lambda event: self.turn_chosen(event.target.wxyz, event.phase == "end"))
+        self._handle.on_update(lambda event: self.turn_chosen(event.target.wxyz, event.phase == "end", event.client_id))
 
-    def turn_chosen(self, wxyz: np.ndarray, is_over: bool) -> None:
-        """Turn the chosen joint as somebody turned the handle, a quaternion; the handle is theirs until that is over."""
-        self._is_turning = not is_over
+    def turn_chosen(self, wxyz: np.ndarray, is_over: bool, client_id: int | None) -> None:
+        """Turn the chosen joint as a client turned the handle, a quaternion; the handle is theirs until that is over."""
+        (self._turning.discard if is_over else self._turning.add)(client_id)
         turn = Rotation.from_quat(np.asarray(wxyz)[[1, 2, 3, 0]])
-        vector = vector_from_turn(self._skeleton, self._viewing.posed.transforms, self.chosen_joint, turn)
+        vector = vector_from_turn(self._skeleton, self._viewing.pause().transforms, self.chosen_joint, turn)
         self._viewing.turn_joint(self.chosen_joint, vector)
+
+    def let_go(self, client_id: int) -> None:
+        """Take the handle back from a client who left, maybe in the middle of a turn."""
+        self._turning.discard(client_id)
 
     def _square(self) -> float:
         """Return the width of a square of the floor: a metre for people, a power of ten that suits other sizes."""

@@ -151,6 +151,7 @@ class ViewServer:
         if first_motion is not None:
             self.viewing.play()
         self.server.on_client_connect(lambda client: self._woken.set())
+        self.server.on_client_disconnect(lambda client: self._part(client.client_id))
         self._thread = threading.Thread(target=self._run, name="snarf-view", daemon=True)
         self._thread.start()
 
@@ -161,6 +162,10 @@ class ViewServer:
         self._thread.join(timeout=10)
         self.viewing.stop()
         self._stop_server()
+
+    def _part(self, client_id: int) -> None:
+        self.scene.let_go(client_id)
+        self._woken.set()
 
     def _stop_server(self) -> None:
         with _silence():

@@ -116,11 +116,11 @@ class Viewing:
             self.player.play(self._clock())
             self._wake()
 
-    def pause(self) -> None:
-        """Hold the motion."""
+    def pause(self) -> Posed:
+        """Hold the motion; return the pose that it is held in."""
         with self._lock:
-            self._held()
             self._wake()
+            return self._held()
 
     def seek(self, frame: int) -> None:
         """Go to a frame of the motion."""

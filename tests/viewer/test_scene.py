@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-
 import numpy as np
 import pytest
 from torch import Tensor
@@ -20,10 +17,9 @@ viser = pytest.importorskip("viser", reason="the viewer needs viser: pip install
 
 @pytest.fixture
 def server():
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-        yield server
-        server.stop()
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
 
 
 @pytest.fixture
@@ -86,3 +82,19 @@ def test_the_shape_beside_stands_on_the_floor_wherever_that_is(scene, watched):
     show_settled(scene, watched)
     feet = scene._canonical._plain.vertices[:, 1].min() + scene._canonical._frame.position[1]
     assert feet == pytest.approx(watched.viewing.floor_y)
+
+
+def test_the_handle_follows_the_joint_unless_somebody_holds_it(scene, watched):
+    straight, quarter = np.array([1.0, 0, 0, 0]), np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    watched.viewing.change_look(shows_skeleton=True)
+    scene.chosen_joint = 1
+    show_settled(scene, watched)
+    for client_id in (3, 4):
+        scene.turn_chosen(quarter, is_over=False, client_id=client_id)
+    scene.turn_chosen(quarter, is_over=True, client_id=4)
+    show_settled(scene, watched)
+    np.testing.assert_allclose(watched.viewing.posed.pose[1], (0, 0, np.pi / 2), atol=1e-6)
+    np.testing.assert_allclose(scene._handle.wxyz, straight, atol=1e-6)  # as the page that turns it has it, not we
+    scene.let_go(3)
+    show_settled(scene, watched)
+    np.testing.assert_allclose(scene._handle.wxyz, quarter, atol=1e-6)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import queue
 import socket
 import urllib.request
 
 import numpy as np
 import pytest
 from toy_avatar import ToyAvatar
-from toy_viewer import SMALL
+from toy_viewer import PATIENCE, SMALL
 
 from snarfcli.errors import UserError
 from snarfcli.motions import Motion
@@ -132,11 +133,19 @@ def test_a_click_chooses_a_joint_and_the_handle_turns_it():
             server.controls.choose_joint(1)
             quarter = np.sqrt(0.5)
             page.expect()
-            server.scene.turn_chosen(np.array([quarter, 0, 0, quarter]), is_over=True)
+            server.scene.turn_chosen(np.array([quarter, 0, 0, quarter]), is_over=True, client_id=0)
             page.until_node("/avatar/plain", "vertices")
             assert server.viewing.posed.pose[1] == pytest.approx([0, 0, np.pi / 2])
     finally:
         server.stop()
+
+
+def test_who_leaves_lets_go_of_the_handle(server, monkeypatch):
+    left = queue.Queue()
+    monkeypatch.setattr(server.scene, "let_go", left.put)
+    with Page(server.server):
+        (client_id,) = server.server.get_clients()
+    assert left.get(timeout=PATIENCE) == client_id
 
 
 def test_an_avatar_without_weights_has_no_choice_of_surface():

@@ -60,13 +60,13 @@ class ShapeBasis:
 
 
 def spread_frames(lengths: Sequence[int], most: int) -> list[tuple[int, int]]:
-    """Return pairs (clip, frame), at most `most` and spread evenly over clips of these many frames; at least one a clip."""
-    share = min(1.0, most / sum(lengths))
-    picked = []
-    for clip, length in enumerate(lengths):
-        count = max(1, min(length, int(length * share)))
-        picked += [(clip, int(frame)) for frame in np.linspace(0, length - 1, count).round()]
-    return picked
+    """Return pairs (clip, frame), at most `most`: those in the middle of equal parts of all clips, one after the other."""
+    ends = np.cumsum(lengths)
+    total = int(ends[-1])
+    count = min(most, total)
+    picked = (2 * np.arange(count) + 1) * total // (2 * count)
+    clips = np.searchsorted(ends, picked, "right")
+    return [(int(clip), int(frame - ends[clip] + lengths[clip])) for clip, frame in zip(clips, picked, strict=True)]
 
 
 def fit_shapes(shapes: NDArray[np.float32], count: int) -> ShapeBasis:

@@ -62,8 +62,15 @@ def test_one_shape_has_no_components(given):
 def test_frames_are_spread_over_all_clips():
     assert spread_frames([3], 10) == [(0, 0), (0, 1), (0, 2)]
     picked = spread_frames([300, 100, 1], 40)
-    assert len(picked) <= 41 and picked[0] == (0, 0) and (0, 299) in picked and (1, 99) in picked and picked[-1] == (2, 0)
-    assert 2 < sum(clip == 0 for clip, _ in picked) / sum(clip == 1 for clip, _ in picked) < 4
+    assert len(picked) == 40 and picked[0] == (0, 5) and picked[-1] == (1, 95)
+    assert set(np.diff([frame + 300 * clip for clip, frame in picked])) <= {10, 11}
+    assert spread_frames([9], 1) == [(0, 4)]
+
+
+def test_many_short_clips_are_seen_in_their_middle():
+    assert spread_frames([5] * 4, 4) == [(clip, 2) for clip in range(4)]
+    picked = spread_frames([10] * 200, 150)
+    assert len(picked) == 150 == len({clip for clip, _ in picked}) and len({frame for _, frame in picked}) == 3
 
 
 def test_deviation_is_over_all_that_came():

@@ -19,7 +19,7 @@ _TRIAL_RAD = 0.35  # standard deviation of each joint's turns about each axis
 # arts that the weights were not made for by 4.5 mm; without trials by 1.0 and 6.4, with trials ten times as heavy by 2.6 and
 # 4.1, and with the largest weights as they are by 15.1 and 18.1.
 _TRIAL_SHARE = 0.01
-_PART = 2000  # vertices at a time: 128 poses of 8 joints of them take 50 MB
+_PART = 2000  # vertices at a time: with 128 poses they take 60 MB at most, however many joints there are
 
 
 def trial_poses(
@@ -102,10 +102,13 @@ def _fitted(
     form of v, whose matrix G sums over the poses.
     """
     points = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1, dtype=np.float64)
-    placed = np.einsum("sjab,nb->snja", transforms[:, :, :3], points)  # by each joint alone
-    wanted = np.einsum("nj,snja->sna", weights.astype(np.float64), placed)
-    apart = np.take_along_axis(placed, joints[None, :, :, None], axis=2) - wanted[:, :, None]
-    products = np.einsum("snca,snda,s->ncd", apart, apart, counts, optimize=True)
+    apart = np.empty((*joints.shape, len(transforms), 3))
+    weights = weights.astype(np.float64)
+    for pose, (matrices, share) in enumerate(zip(transforms[:, :, :3], np.sqrt(counts), strict=True)):
+        blended = (weights @ matrices.reshape(-1, 12)).reshape(-1, 1, 3, 4)
+        apart[:, :, pose] = share * np.einsum("ncab,nb->nca", matrices[joints] - blended, points)
+    apart = apart.reshape(*joints.shape, -1)
+    products = apart @ apart.transpose(0, 2, 1)
     prior = values / values.sum(axis=1, keepdims=True)
     alive = np.ones(values.shape, dtype=bool)
     best = prior

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from toy_character import ToyCharacter, wave
@@ -48,6 +50,18 @@ def test_more_columns_than_joints_are_zeros():
     joints, values = few_influences(MESH.weights, 8, MESH.vertices, *TRIALS)
     assert joints.shape[1] == 8 and (values[:, 6:] == 0).all()
     np.testing.assert_allclose(dense_weights(joints, values, 6), MESH.weights, atol=1e-6)
+
+
+def test_memory_does_not_grow_with_the_joints():
+    rng = np.random.default_rng(0)
+    weights = rng.dirichlet(np.ones(150), 2000).astype(np.float32)
+    poses = np.tile(np.eye(4), (16, 150, 1, 1))
+    poses[..., :3, 3] = rng.normal(size=(16, 150, 3))
+    tracemalloc.start()
+    few_influences(weights, 4, rng.normal(size=(2000, 3)).astype(np.float32), poses, np.full(16, 1 / 16))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 40e6  # placed by every joint they would take 115 MB
 
 
 def test_a_clip_that_stands_still_does_not_decide_alone():

@@ -100,7 +100,7 @@ class Controls:
 
     def _add_pose(self) -> None:
         gui = self._gui
-        with gui.add_folder("Joint"):
+        with gui.add_folder("Joint", visible=bool(self._labels)):  # a skeleton of one joint has its root only
             joints = tuple(self._labels) or ("none",)
             self._joint = gui.add_dropdown("Joint", joints, hint="or click one in the picture (Look: skeleton)")
             self._angles = self._add_angles()
@@ -119,9 +119,6 @@ class Controls:
         buttons.on_click(lambda event: self._press(event.target.value))
         reset.on_click(lambda event: self._viewing.reset_pose())
         save.on_click(lambda event: self._save(event.client))
-        if not self._labels:  # a skeleton of one joint has its root only
-            for handle in (self._joint, *self._angles, buttons):
-                handle.disabled = True
         self._scene_joint()
 
     def _add_angles(self) -> list[Any]:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import queue
 import socket
 import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from toy_avatar import ToyAvatar
 from toy_viewer import PATIENCE, SMALL
 
+from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError
 from snarfcli.motions import Motion
 from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback
@@ -20,6 +23,17 @@ pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[
 from viser_page import Page  # noqa: E402
 
 FACTS = {"subject": "toy", "data": "none", "model": "capsules", "joints": "2"}
+
+
+class OneJoint(ToyAvatar):
+    """Both capsules hang on the root."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.skeleton = Skeleton(("root",), (-1,), torch.zeros(1, 3), torch.zeros(1, 3))
+
+    def skinning_weights(self, points_c: torch.Tensor) -> torch.Tensor:
+        return points_c.new_ones(len(points_c), 1)
 
 
 def load_motion(name: str):
@@ -159,6 +173,20 @@ def test_an_avatar_without_weights_has_no_choice_of_surface():
             shown = {props["label"]: props for props in inputs}
             assert not shown["Weights in colour"]["visible"] and not shown["Canonical shape beside it"]["visible"]
             assert shown["Surface"]["options"] == ["field"]
+    finally:
+        server.stop()
+
+
+def test_a_skeleton_of_one_joint_turns_as_a_whole():
+    server = ViewServer(OneJoint(), replace(SMALL, shows_skeleton=True))
+    try:
+        with Page(server.server) as page:
+            page.until_text("vertices")
+            folders = [message["props"] for message in page.messages if message["type"] == "GuiFolderMessage"]
+            assert {props["label"]: props["visible"] for props in folders} == {"Joint": False, "Whole body": True}
+            page.change("turn z", 90.0, number=1)
+            page.until_node("/avatar/plain", "vertices")
+            assert server.viewing.posed.pose == pytest.approx(np.array([[0, 0, np.pi / 2]]))
     finally:
         server.stop()
 

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path
@@ -41,7 +42,7 @@ def convert(blender: list[str], glb: Path, path: Path, frame_rate: float) -> int
     Args:
         blender: see `find_blender`.
         glb: the file to read.
-        path: the file to write, .fbx or .usd.
+        path: the file to write, .fbx or .usd in either case of letters.
         frame_rate: frames a second of its clips; Blender keys whole frames.
 
     Returns:
@@ -50,16 +51,19 @@ def convert(blender: list[str], glb: Path, path: Path, frame_rate: float) -> int
     Raises:
         UserError: Blender failed; the message ends with its own last words.
     """
-    with atomic_path(path) as temporary:
-        command = [*blender, str(_JOB), "--", str(glb), str(temporary), repr(float(frame_rate))]
+    kind = path.suffix[1:].lower()
+    with TemporaryDirectory() as folder:
+        made = Path(folder) / f"made.{kind}"  # Blender goes by suffixes, and not everywhere by .FBX
+        command = [*blender, str(_JOB), "--", str(glb), str(made), repr(float(frame_rate)), kind]
         try:
             done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             raise UserError(f"Blender did not finish {path.name} in {_TIMEOUT_S // 60} minutes; give format=glb") from None
         # Some versions of the package crash on their way out, with the file complete: its last words count, not its code.
-        if "snarf: written" not in done.stdout or not temporary.is_file() or not temporary.stat().st_size:
+        if "snarf: written" not in done.stdout or not made.is_file() or not made.stat().st_size:
             words = [line for line in (done.stdout + "\n" + done.stderr).splitlines() if line.strip()]
             reason = words[-1].strip()[:200] if words else f"exit code {done.returncode}"
             raise UserError(f"Blender could not write {path.name} ({reason}); give format=glb, or try another Blender")
-        size = temporary.stat().st_size
-    return size
+        with atomic_path(path) as temporary:
+            shutil.copyfile(made, temporary)
+        return made.stat().st_size

@@ -10,8 +10,8 @@ __all__ = ["main"]
 _GAP = 10  # frames between clips
 
 
-def main(glb: str, path: str, frame_rate: str) -> None:
-    """Convert one file; keys fall on whole frames of `frame_rate`."""
+def main(glb: str, path: str, frame_rate: str, kind: str) -> None:
+    """Convert one file to fbx or usd; keys fall on whole frames of `frame_rate`."""
     import bpy
 
     rate = float(frame_rate)
@@ -30,7 +30,7 @@ def main(glb: str, path: str, frame_rate: str) -> None:
     moving = [item for item in bpy.data.objects if item.type == "ARMATURE"]
     moving += [item.data.shape_keys for item in meshes if item.data.shape_keys]
     scene.frame_end = _lay_out([item.animation_data for item in moving if item.animation_data])
-    if path.endswith(".fbx"):
+    if kind == "fbx":
         bpy.ops.export_scene.fbx(
             filepath=path,
             object_types={"ARMATURE", "MESH"},

@@ -282,7 +282,8 @@ def fake_blender(tmp_path, monkeypatch):
     def install(body: str) -> None:
         (tmp_path / "bin").mkdir()
         program = tmp_path / "bin" / "blender"
-        program.write_text(f"#!{sys.executable}\nimport sys\nglb, path, rate = sys.argv[sys.argv.index('--') + 1 :]\n{body}\n")
+        arguments = "glb, path, rate, kind = sys.argv[sys.argv.index('--') + 1 :]"
+        program.write_text(f"#!{sys.executable}\nimport sys\n{arguments}\n{body}\n")
         program.chmod(0o755)
 
     return install
@@ -295,19 +296,26 @@ def test_without_blender_one_line_says_how_to_get_it(folder, toy, capsys, fake_b
 
 
 def test_blender_gets_a_whole_glb(folder, capsys, fake_blender):
-    fake_blender("data = open(glb, 'rb').read(); open(path, 'wb').write(data[:4] + rate.encode()); print('snarf: written')")
+    fake_blender("open(path, 'wb').write(open(glb, 'rb').read()[:4] + (rate + kind).encode()); print('snarf: written')")
     assert export(capsys, "--pose", pose_file("walk.npz", 3), "format=fbx")[0] == 0
-    assert (folder / "export" / "50002.fbx").read_bytes() == b"glTF24.0"
+    assert (folder / "export" / "50002.fbx").read_bytes() == b"glTF24.0fbx"
     assert sorted(path.name for path in (folder / "export").iterdir()) == ["50002.fbx", "50002_fbx.json"]
     code, err = export(capsys, "--pose", "walk.npz", "--pose", "walk.npz", "format=usd")
     assert code == 2 and "usd holds one timeline, got 2 motions" in err
+
+
+@pytest.mark.parametrize("kind", ["fbx", "usd"])
+def test_blender_is_told_the_format_whatever_the_case_of_the_suffix(folder, capsys, fake_blender, kind):
+    fake_blender("open(path, 'w').write(kind + path[-4:]); print('snarf: written')")
+    assert export(capsys, "--pose", pose_file("walk.npz", 2), f"format={kind}", f"output=ME.{kind.upper()}")[0] == 0
+    assert Path(f"ME.{kind.upper()}").read_text() == f"{kind}.{kind}"
 
 
 def test_a_crash_of_blender_leaves_nothing(folder, capsys, fake_blender):
     fake_blender("open(path, 'wb').write(b'half'); print('about to'); sys.exit('Error: out of patience')")
     code, err = export(capsys, "--pose", pose_file("walk.npz", 2), "format=fbx")
     assert code == 2 and "Blender could not write 50002.fbx (Error: out of patience); give format=glb" in err
-    assert not any((folder / "export").iterdir())
+    assert not (folder / "export").exists()
 
 
 def test_the_report_says_what_a_clip_lasts():

@@ -118,6 +118,12 @@ def _check(config: ExportConfig) -> CharacterOptions:
     )
     check_options(options)
     check_motion_choice(config)
+    if config.format in MESH_WRITERS:
+        unused = {name: getattr(config, name) for name in ("influences", "morph_targets")}
+        given = [f"{name}={value}" for name, value in unused.items() if value != getattr(CharacterOptions, name)]
+        if given:  # a line, no refusal: presets set them whatever the format
+            text = "%s: not used, meshes of format=%s have all weights and their own shape"
+            log.warning(text, ", ".join(given), config.format)
     return options
 
 

@@ -108,6 +108,13 @@ def test_a_mesh_a_frame(folder, toy, capsys, suffix):
     assert code == 2 and "holds notes.txt, which is no frame of an export" in err and (place / "notes.txt").exists()
 
 
+def test_what_meshes_do_not_use_is_said(folder, capsys, caplog):
+    arguments = ("--pose", pose_file("walk.npz", 1), "format=ply", "output=out", "overwrite=true")
+    assert export(capsys, *arguments)[0] == 0 and "not used" not in caplog.text
+    assert export(capsys, *arguments, "influences=8", "morph_targets=0")[0] == 0
+    assert "influences=8, morph_targets=0: not used, meshes of format=ply have all weights" in caplog.text
+
+
 def test_several_clips_of_meshes_have_a_folder_each(folder, capsys):
     pose_file("walk.npz", 2)
     assert export(capsys, "--pose", "walk.npz", "--pose", "walk.npz", "format=ply", "output=out")[0] == 0

@@ -43,9 +43,9 @@ _RECORD = "export.json"
 class ExportConfig(MotionChoice, AvatarChoice):
     """Settings of `snarf export`."""
 
-    pose: list[str] = MISSING
+    pose: list[str] | None = MISSING
     """Motion files, each a clip: .npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf, or a folder of frames."""
-    motion: list[str] = MISSING
+    motion: list[str] | None = MISSING
     """Built-in motions of SMPL's joints, or sequences of the samples of any other skeleton, each a clip; with neither these nor
     pose files there is one clip, jumping_jacks or the held-out sequence."""
     format: str = MISSING
@@ -147,8 +147,8 @@ def _check_place(config: ExportConfig, output: Path) -> Path:
 
 def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:
     """Read all motions."""
-    wanted: list[tuple[str | None, str | None]] = [(pose, None) for pose in config.pose]
-    wanted += [(None, motion) for motion in config.motion]
+    wanted: list[tuple[str | None, str | None]] = [(pose, None) for pose in config.pose or ()]
+    wanted += [(None, motion) for motion in config.motion or ()]
     clips = []
     for pose, motion in wanted or [(None, None)]:
         chosen = choose_motion(config, config, avatar.skeleton, pose, motion)

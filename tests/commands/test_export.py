@@ -73,6 +73,13 @@ def test_pose_files_become_clips(folder, capsys, caplog):
         assert part in text
 
 
+def test_null_is_no_motion_file(folder, capsys):
+    code, err = export(capsys, "pose=null", "motion=null")
+    assert code == 2 and "motion jumping_jacks is for SMPL's 24 joints" in err  # what there is without either
+    pose_file("walk.npz", 1)
+    assert export(capsys, "pose=[walk.npz]", "motion=null")[0] == 0
+
+
 def test_frames_rate_and_place_are_chosen_as_for_animate(folder, capsys):
     pose_file("walk.npz", 9)
     code, err = export(

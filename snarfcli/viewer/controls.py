@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from snarfcli.errors import UserError
-from snarfcli.viewer.joints import ANGLE_LIMITS_DEG, angles_of, joint_labels, pose_file, vector_of
+from snarfcli.viewer.inputs import AngleSliders, on_user, rounded
+from snarfcli.viewer.joints import joint_labels, pose_file
 from snarfcli.viewer.picture import RESOLUTIONS, SURFACE_NAMES, Picture
 from snarfcli.viewer.scene import Scene
 from snarfcli.viewer.viewing import Viewing
@@ -18,11 +18,9 @@ from snarfcli.viewer.viewing import Viewing
 __all__ = ["NO_MOTION", "Controls"]
 
 NO_MOTION = "none"
-_AXES = ("x", "y", "z")
 _SPEEDS = (0.1, 2.0)
 _TEXT_EVERY_S = 0.25
 _MEASURED, _MEASURED_S = 31, 6.0  # frames and seconds that the rate is measured over
-_SAME_RAD = 2e-3  # sliders count tenths of a degree
 _REACH_M = 3.0  # of the slider for the height, about the body's size of a person
 
 
@@ -90,12 +88,12 @@ class Controls:
         in_place = gui.add_checkbox(
             "Stay in place", self._viewing.look.is_in_place, hint="the body keeps its height, but does not travel"
         )
-        _on_user(self._motion, lambda handle, client: self._choose_motion(handle.value, client))
+        on_user(self._motion, lambda handle, client: self._choose_motion(handle.value, client))
         self._play.on_click(lambda event: self._play_or_pause())
-        _on_user(self._frame, lambda handle, client: self._seek(handle.value))
-        _on_user(speed, lambda handle, client: self._viewing.change_speed(handle.value))
-        _on_user(loop, lambda handle, client: self._viewing.change_looping(handle.value))
-        _on_user(in_place, lambda handle, client: self._viewing.change_look(is_in_place=handle.value))
+        on_user(self._frame, lambda handle, client: self._seek(handle.value))
+        on_user(speed, lambda handle, client: self._viewing.change_speed(handle.value))
+        on_user(loop, lambda handle, client: self._viewing.change_looping(handle.value))
+        on_user(in_place, lambda handle, client: self._viewing.change_look(is_in_place=handle.value))
         self._fit_frames()
 
     def _add_pose(self) -> None:
@@ -103,29 +101,25 @@ class Controls:
         with gui.add_folder("Joint", visible=bool(self._labels)):  # a skeleton of one joint has its root only
             joints = tuple(self._labels) or ("none",)
             self._joint = gui.add_dropdown("Joint", joints, hint="or click one in the picture (Look: skeleton)")
-            self._angles = self._add_angles()
+            self._angles = self._add_angles(lambda: self.joint)
             buttons = gui.add_button_group("", ("Straight", "Mirror"), hint="mirror: turn the joint of the other side alike")
         with gui.add_folder("Whole body"):
-            self._turns = self._add_angles()
+            self._turns = self._add_angles(lambda: 0)
             self._height = gui.add_slider("height", -_REACH_M, _REACH_M, 0.01, 0.0, hint="metres above its place at rest")
         reset = gui.add_button("Reset pose", icon="refresh")
         save = gui.add_button("Save pose", icon="download", hint="as .npz, which --pose reads again")
-        _on_user(self._joint, lambda handle, client: self._scene_joint())
-        for slider in self._angles:
-            _on_user(slider, lambda handle, client: self._turn(self.joint, self._angles))
-        for slider in self._turns:
-            _on_user(slider, lambda handle, client: self._turn(0, self._turns))
-        _on_user(self._height, lambda handle, client: self._viewing.move_root(1, handle.value))
+        on_user(self._joint, lambda handle, client: self._scene_joint())
+        on_user(self._height, lambda handle, client: self._viewing.move_root(1, handle.value))
         buttons.on_click(lambda event: self._press(event.target.value))
         reset.on_click(lambda event: self._viewing.reset_pose())
         save.on_click(lambda event: self._save(event.client))
         self._scene_joint()
 
-    def _add_angles(self) -> list[Any]:
-        return [
-            self._gui.add_slider(f"turn {axis}", -limit, limit, 0.1, 0.0, hint=f"degrees about the parent's {axis} axis, {way}")
-            for axis, limit, way in zip(_AXES, ANGLE_LIMITS_DEG, ("to the left", "up", "to the front"), strict=True)
-        ]
+    def _add_angles(self, joint: Callable[[], int]) -> AngleSliders:
+        viewing = self._viewing
+        return AngleSliders(
+            self._gui, lambda: viewing.pause().pose[joint()], lambda vector: viewing.turn_joint(joint(), vector)
+        )
 
     def _add_look(self) -> None:
         gui, look = self._gui, self._viewing.look
@@ -170,16 +164,16 @@ class Controls:
 
             return change_it
 
-        _on_user(surface, change_surface)
-        _on_user(self._skinned_resolution, change("skinned_resolution", int))
-        _on_user(self._field_resolution, change("field_resolution", int))
-        _on_user(pose_shape, change("has_pose_shape"))
-        _on_user(weights, change("weight_colors"))
-        _on_user(canonical, change("shows_canonical"))
-        _on_user(skeleton, change("shows_skeleton"))
-        _on_user(handle_box, change_handle)
-        _on_user(wireframe, change_scene("is_wireframe"))
-        _on_user(color, change_scene("body_color"))
+        on_user(surface, change_surface)
+        on_user(self._skinned_resolution, change("skinned_resolution", int))
+        on_user(self._field_resolution, change("field_resolution", int))
+        on_user(pose_shape, change("has_pose_shape"))
+        on_user(weights, change("weight_colors"))
+        on_user(canonical, change("shows_canonical"))
+        on_user(skeleton, change("shows_skeleton"))
+        on_user(handle_box, change_handle)
+        on_user(wireframe, change_scene("is_wireframe"))
+        on_user(color, change_scene("body_color"))
         camera.on_click(lambda event: event.client and self._scene.frame_body(event.client.camera))
 
     # ---------------------------------------------------------------- what was chosen
@@ -199,9 +193,6 @@ class Controls:
         self._scene.chosen_joint = self.joint
         self._seen_pose = -1
         self._viewing.change_look()
-
-    def _turn(self, joint: int, sliders: Sequence[Any]) -> None:
-        self._viewing.turn_joint(joint, vector_of(np.array([slider.value for slider in sliders])))
 
     def _press(self, button: str) -> None:
         if button == "Mirror":
@@ -260,9 +251,9 @@ class Controls:
             self._play.icon = "player-pause" if picture.is_playing else "player-play"
         if not picture.is_playing and picture.posed.number != self._seen_pose:
             self._seen_pose = picture.posed.number
-            self._set_angles(self._angles, picture.posed.pose[self.joint])
-            self._set_angles(self._turns, picture.posed.pose[0])
-            self._height.value = _rounded(np.clip(picture.posed.translation[1], -_REACH_M, _REACH_M), 2)
+            self._angles.show(picture.posed.pose[self.joint])
+            self._turns.show(picture.posed.pose[0])
+            self._height.value = rounded(np.clip(picture.posed.translation[1], -_REACH_M, _REACH_M), 2)
             self._set_frame(picture.frame)
         if now < self._next_text:
             return self._next_text - now
@@ -275,15 +266,6 @@ class Controls:
     def _set_frame(self, frame: int) -> None:
         if self._viewing.motion is not None:
             self._frame.value = min(frame, int(self._frame.max))
-
-    @staticmethod
-    def _set_angles(sliders: Sequence[Any], vector: np.ndarray) -> None:
-        """Set sliders to a rotation, unless they stand for it already: other angles might mean the same."""
-        stand = Rotation.from_rotvec(vector_of(np.array([slider.value for slider in sliders])))
-        if (stand.inv() * Rotation.from_rotvec(vector)).magnitude() < _SAME_RAD:
-            return
-        for slider, angle in zip(sliders, angles_of(vector), strict=True):
-            slider.value = _rounded(angle, 1)
 
     def _status(self, picture: Picture, now: float) -> str:
         """Return what is shown, how fast, and what went wrong, as Markdown."""
@@ -304,18 +286,3 @@ class Controls:
         lines = [f"**{title}**", " · ".join(parts), " · ".join(times) or "&nbsp;"]
         lines += [f"⚠ {text}" for text in (self._notice, picture.message) if text]
         return "  \n".join(lines)
-
-
-def _rounded(number: float, digits: int) -> float:
-    """Return a number as sliders show it; without the sign of a rounded zero."""
-    return round(float(number), digits) + 0.0
-
-
-def _on_user(handle: Any, react: Callable[[Any, Any], None]) -> None:
-    """Call `react` with the handle and the client when somebody changes an input; not when the program does."""
-
-    def updated(event: Any) -> None:
-        if event.client is not None:
-            react(event.target, event.client)
-
-    handle.on_update(updated)

@@ -74,9 +74,10 @@ class Viewing:
 
     def mirror_joint(self, joint: int) -> None:
         """Turn the joint on the other side as this one is turned, mirrored."""
-        other, vector = mirrored_joint(self.body.skeleton, joint, self.posed.pose[joint])
-        if other != joint:
-            self.turn_joint(other, vector)
+        with self._lock:
+            other, vector = mirrored_joint(self.body.skeleton, joint, self._held().pose[joint])
+            if other != joint:
+                self.turn_joint(other, vector)
 
     def move_root(self, axis: int, metres: float) -> None:
         """Put the root at so many metres from its place at rest, along one axis."""

@@ -16,6 +16,7 @@ from toy_viewer import PATIENCE, SMALL
 from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError
 from snarfcli.motions import Motion
+from snarfcli.viewer.joints import angles_of
 from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
@@ -40,7 +41,7 @@ def load_motion(name: str):
     if name == "broken":
         raise UserError("no such\nmotion")
     poses = np.zeros((4, 2, 3))
-    poses[:, 1, 2] = np.linspace(0, 0.9, 4)
+    poses[:, 1, 2] = 0.9 if name == "still" else np.linspace(0, 0.9, 4)
     motion = Motion(name, poses, np.zeros((4, 3)), 20.0)
     return (motion.slice(3) if name == "pose" else motion), None
 
@@ -102,6 +103,20 @@ def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(server):
         page.change("Motion", "none")
         page.change("turn z", 10.0)
         page.until_node("/avatar/plain", "vertices")
+
+
+def test_a_slider_changes_one_angle_of_a_pose_that_plays(server):
+    with Page(server.server) as page:
+        page.until_text("vertices")
+        page.expect()
+        with server.viewing._lock:  # no picture before it plays, so the sliders stay at zero
+            server.viewing.load_motion(load_motion("still")[0])
+            server.viewing.play()
+        page.until(lambda message: message.get("updates", {}).get("label") == "Pause")
+        page.change("turn x", 10.0)
+        turn = page.uuid("turn z")
+        page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == pytest.approx(51.6))
+        assert angles_of(server.viewing.posed.pose[1]) == pytest.approx((10, 0, np.degrees(0.9)))
 
 
 def test_the_sliders_show_a_motion_of_one_frame(server):

@@ -29,6 +29,7 @@ from snarfcli.export.rig import Clip
 from snarfcli.export.sequence import atomic_folder, check_folder, write_sequence
 from snarfcli.files import write_json
 from snarfcli.models.avatar import Avatar
+from snarfcli.names import folder_name
 from snarfcli.runs import machine_facts, run_folder
 
 __all__ = ["ExportConfig", "run"]
@@ -83,10 +84,12 @@ def run(config: ExportConfig) -> int:
         _check_place(config, Path(config.output))
     elif config.ckpt is None:
         trained_on = config.data.avatars or config.data.name
-        _check_place(config, _place(config, run_folder(config.output_root, trained_on, config.subject, config.run)))
+        folder = run_folder(config.output_root, trained_on, config.subject, config.run)
+        _check_place(config, _place(config, folder, config.subject))
     avatar, path = load_chosen_avatar(config)
     check_avatar(avatar)
-    output = _check_place(config, Path(config.output) if config.output else _place(config, path.parent))
+    output = Path(config.output) if config.output else _place(config, path.parent, _subject(config, avatar))
+    output = _check_place(config, output)
     clips = _clips(config, avatar)
     if config.format == "usd" and len(clips) > 1:
         raise UserError(f"usd holds one timeline, got {len(clips)} motions; export them one by one, or give format=glb")
@@ -127,10 +130,15 @@ def _check(config: ExportConfig) -> CharacterOptions:
     return options
 
 
-def _place(config: ExportConfig, folder: Path) -> Path:
+def _subject(config: ExportConfig, avatar: Avatar) -> str:
+    """Return whose avatar it is, which with ckpt=FILE only the avatar knows, as a file or mesh may be called."""
+    return folder_name(str(avatar.facts.get("subject") or config.subject), "avatar")
+
+
+def _place(config: ExportConfig, folder: Path, subject: str) -> Path:
     """Return where the result goes if nobody says so: a file, or for meshes a folder."""
     joint = "_" if config.format in MESH_WRITERS else "."
-    return folder / "export" / f"{config.subject}{joint}{config.format}"
+    return folder / "export" / f"{subject}{joint}{config.format}"
 
 
 def _check_place(config: ExportConfig, output: Path) -> Path:
@@ -164,8 +172,9 @@ def _write_character(
     config: ExportConfig, avatar: Avatar, clips: list[Clip], options: CharacterOptions, output: Path, blender: list[str]
 ) -> _Written:
     """Write the file; in a format of Blender's from a temporary .glb."""
+    subject = _subject(config, avatar)
     export: Callable[[Path], ExportReport] = lambda path: export_character(  # noqa: E731
-        avatar, path, clips, options, name=config.subject, overwrite=config.overwrite
+        avatar, path, clips, options, name=subject, overwrite=config.overwrite
     )
     if not blender:
         report = export(output)
@@ -175,7 +184,7 @@ def _write_character(
         if len(rates) > 1:
             log.warning("the motions have several frame rates, %s has one: %g", config.format, clips[0].motion.frame_rate)
         with TemporaryDirectory() as folder:
-            glb = Path(folder) / f"{config.subject}.glb"
+            glb = Path(folder) / f"{subject}.glb"
             report = export(glb)
             log.info("converting to %s in Blender", config.format)
             size = convert(blender, glb, output, clips[0].motion.frame_rate)

@@ -29,6 +29,7 @@ SMALL = ("resolution=40", "triangles=400", "device=cpu")
 @pytest.fixture
 def toy(monkeypatch) -> ToyCharacter:
     avatar = ToyCharacter()
+    avatar.facts = {"subject": "50002"}
     monkeypatch.setattr(choices.Avatar, "load", classmethod(lambda cls, path, device: avatar))
     return avatar
 
@@ -71,6 +72,19 @@ def test_pose_files_become_clips(folder, capsys, caplog):
     text = " ".join(caplog.text.split())
     for part in ("4 influences instead of 6", "targets explain", "walk_2 (5 frames, 0.17 s at 24)", "MB", "triangles; 6 j"):
         assert part in text
+
+
+def test_an_avatar_given_by_its_file_names_what_is_made_of_it(folder, toy, capsys):
+    toy.facts = {"subject": "../my dog"}
+    Path("elsewhere").mkdir()
+    (Path("elsewhere") / "avatar.pt").write_bytes(b"the toy")
+    code, err = export(capsys, "--pose", pose_file("walk.npz", 1), "ckpt=elsewhere/avatar.pt")
+    assert code == 0, err
+    reader = GlbReader(Path("elsewhere/export/my_dog.glb"))
+    assert reader.gltf.meshes[0].name == "my_dog" and "my_dog_rig" in [node.name for node in reader.gltf.nodes]
+    toy.facts = {}
+    assert export(capsys, "--pose", "walk.npz", "ckpt=elsewhere", "format=ply")[0] == 0
+    assert Path("elsewhere/export/50002_ply").is_dir()
 
 
 def test_null_is_no_motion_file(folder, capsys):

@@ -100,8 +100,8 @@ def run(config: ExportConfig) -> int:
     write = _write_meshes if config.format in MESH_WRITERS else _write_character
     facts, lines, skipped = write(config, avatar, clips, options, output, blender)
     seconds = round(time.perf_counter() - start, 2)
-    record = output / _RECORD if output.is_dir() else output.with_name(f"{output.stem}_{output.suffix[1:]}.json")
-    write_json(record, {"config": asdict(config), "avatar": str(path), **facts, "seconds": seconds, **machine_facts()})
+    record = {"config": asdict(config), "avatar": str(path), **facts, "seconds": seconds, **machine_facts()}
+    write_json(_record(config, output), record)
     for line in lines:
         log.info("%s", line)
     for name, frame, reason in skipped:
@@ -150,7 +150,13 @@ def _check_place(config: ExportConfig, output: Path) -> Path:
         hint = f"give format={suffix}, or " if suffix in (*BLENDER_FORMATS, "glb") else ""
         raise UserError(f"output {output} should end in .{config.format}; {hint}give another name")
     check_output(output, config.overwrite)
+    check_output(_record(config, output), config.overwrite)
     return output
+
+
+def _record(config: ExportConfig, output: Path) -> Path:
+    """Return where the record goes: into a folder of meshes, or beside a file."""
+    return output / _RECORD if config.format in MESH_WRITERS else output.with_name(f"{output.stem}_{output.suffix[1:]}.json")
 
 
 def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:

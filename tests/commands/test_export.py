@@ -213,6 +213,15 @@ def test_an_existing_file_stays_until_overwrite(folder, capsys):
     assert export(capsys, *arguments, "overwrite=true")[0] == 0 and path.read_bytes()[:4] == b"glTF"
 
 
+def test_a_file_where_the_record_goes_stays_until_overwrite(folder, toy, capsys):
+    Path("me_glb.json").write_text("mine")
+    arguments = ("--pose", pose_file("walk.npz", 1), "output=me.glb")
+    code, err = export(capsys, *arguments)
+    assert code == 2 and "me_glb.json is there already; give overwrite=true to replace it" in err
+    assert Path("me_glb.json").read_text() == "mine" and not Path("me.glb").exists()
+    assert export(capsys, *arguments, "overwrite=true")[0] == 0 and "me.glb" in Path("me_glb.json").read_text()
+
+
 def test_a_crash_leaves_nothing(folder, capsys, monkeypatch):
     def fail(self, *arguments):
         raise OSError(28, "No space left on device", None)

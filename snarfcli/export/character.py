@@ -29,11 +29,10 @@ from snarfcli.export.rig import (
 )
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
-from snarfcli.meshing.skinned import skin_vertices
+from snarfcli.meshing.skinned import SkinnedSurface, skin_vertices
 from snarfcli.progress import progress
 
 if TYPE_CHECKING:
-    from snarfcli.meshing.skinned import SkinnedSurface
     from snarfcli.models.avatar import Avatar
 
 __all__ = [
@@ -147,17 +146,28 @@ def character_surface(avatar: Avatar, options: CharacterOptions) -> SkinnedSurfa
     Raises:
         UserError: the avatar has no skinning weights or no surface, or so few triangles cannot be.
     """
-    from snarfcli.meshing.skinned import SkinnedSurface
-
     check_avatar(avatar)
     try:
         surface = avatar.skinned_surface(options.resolution)
-        if options.triangles is None or len(surface.mesh.faces) <= options.triangles:
-            return surface
-        log.info("decimating %d triangles to %d", len(surface.mesh.faces), options.triangles)
-        return SkinnedSurface(avatar, options.resolution, mesh=_decimated(surface.mesh, options.triangles))
+        if options.triangles is not None and len(surface.mesh.faces) > options.triangles:
+            log.info("decimating %d triangles to %d", len(surface.mesh.faces), options.triangles)
+            surface = SkinnedSurface(avatar, options.resolution, mesh=_decimated(surface.mesh, options.triangles))
+        return _FixedSurface(surface) if avatar.config.model.condition.name == "none" else surface
     except (EmptySurface, FullSurface) as error:
         raise UserError(f"this avatar has no surface to export: {error}; train it longer, or give another by ckpt=") from None
+
+
+class _FixedSurface(SkinnedSurface):
+    """The surface of a shape that does not depend on the pose: its level set is looked for in the first pose alone."""
+
+    def __init__(self, surface: SkinnedSurface) -> None:
+        vars(self).update(vars(surface))
+        self._vertices: NDArray[np.float32] | None = None
+
+    def canonical_vertices(self, pose: torch.Tensor) -> NDArray[np.float32]:
+        if self._vertices is None:
+            self._vertices = super().canonical_vertices(pose)
+        return self._vertices
 
 
 def _decimated(mesh: Mesh, triangles: int) -> Mesh:

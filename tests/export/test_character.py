@@ -320,3 +320,22 @@ def test_without_weights_or_motions_there_is_no_character(toy, tmp_path, monkeyp
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
     with pytest.raises(UserError, match="a rig needs skinning weights of canonical points, which model toy does not have"):
         export_character(toy, tmp_path / "worm.glb", [Clip(wave(2))], FEW)
+
+
+def test_a_shape_without_condition_is_looked_for_once(tmp_path, monkeypatch):
+    toy = ToyCharacter(bulge=0.0)
+    follow, calls = SkinnedSurface.canonical_vertices, []
+    monkeypatch.setattr(SkinnedSurface, "canonical_vertices", lambda self, pose: calls.append(0) or follow(self, pose))
+    counts, files = [], []
+    for name in ("global", "none"):
+        toy.config.model.condition.name = name
+        export_character(toy, tmp_path / f"{name}.glb", [Clip(wave(5))], FEW, name="worm")
+        surface = character_surface(toy, FEW)
+        clip = Clip(wave(5))
+        written = GlbReader(tmp_path / f"{name}.glb").vertices("wave", 3 / FRAME_RATE)
+        files.append([written, posed(surface, clip, 3), posed(surface, clip, 4)])
+        counts.append(len(calls))
+        calls.clear()
+    assert counts == [7, 2]
+    for conditioned, fixed in zip(*files, strict=True):
+        np.testing.assert_allclose(fixed, conditioned, atol=1e-6)

@@ -138,7 +138,7 @@ class ViewServer:
             raise UserError(f"port {port} is in use; port {self.port} is free: give --port {self.port}")
         if first_motion is not None:
             self.viewing.load_motion(*first_motion[1:])
-        self.scene = Scene(self.server, self.viewing, lambda joint: self.controls.choose_joint(joint))
+        self.scene = Scene(self.server, self.viewing, lambda joint: self.controls.pose.choose_joint(joint))
         self.controls = Controls(
             self.server,
             self.viewing,

@@ -138,9 +138,9 @@ def test_pose_files_are_on_the_shelf_and_the_first_one_plays(served):
     files = [pose_file("wave.npz"), pose_file("bend.npz", 5), pose_file("other/wave.npz", 4)]
     server = served(pose=files)
     assert server.viewing.player.is_playing and server.viewing.motion.num_frames == 3
-    assert server.controls._motion.options == ("none", "file: wave.npz", "file: bend.npz", "file: other/wave.npz")
-    assert server.controls._motion.value == "file: wave.npz"
-    server.controls._choose_motion("file: other/wave.npz", None)
+    assert server.controls.motion.names.options == ("none", "file: wave.npz", "file: bend.npz", "file: other/wave.npz")
+    assert server.controls.motion.names.value == "file: wave.npz"
+    server.controls.motion.choose("file: other/wave.npz")
     assert server.viewing.motion.num_frames == 4
 
 
@@ -148,9 +148,9 @@ def test_no_pose_file_hides_another_one(served):
     files = [pose_file("other/wave.npz", 4), pose_file("wave.npz"), "wave.npz"]
     server = served(pose=files)
     names = ("file: other/wave.npz", "file: wave.npz", "file: wave.npz_2")
-    assert server.controls._motion.options == ("none", *names)
+    assert server.controls.motion.names.options == ("none", *names)
     assert server.viewing.motion.num_frames == 4
-    server.controls._choose_motion(names[1], None)
+    server.controls.motion.choose(names[1])
     assert server.viewing.motion.num_frames == 3
 
 
@@ -159,10 +159,10 @@ def test_sequences_of_the_samples_are_on_the_shelf(served, config, toy, monkeypa
     store = SimpleNamespace(skeleton=skeleton, all_sequences=[SimpleNamespace(name="trot"), SimpleNamespace(name="sit")])
     monkeypatch.setattr(view.SampleStore, "open", staticmethod(lambda *arguments: store))
     server = served(data=DataConfig("meshes", 1, 1, 1), ckpt="outputs/builtin/50002/fast_snarf")
-    assert server.controls._motion.options == ("none", "trot", "sit")
+    assert server.controls.motion.names.options == ("none", "trot", "sit")
     store.skeleton = SimpleNamespace(names=("a", "b"), parents=(-1, 0))
     server = served(data=DataConfig("meshes", 1, 1, 1), ckpt="outputs/builtin/50002/fast_snarf")
-    assert server.controls._motion.options == ("none",)
+    assert server.controls.motion.names.options == ("none",)
 
 
 def test_ctrl_c_stops_the_server(config, monkeypatch, capsys):

@@ -155,11 +155,11 @@ def test_a_click_chooses_a_joint_and_the_handle_turns_it():
         with Page(server.server) as page:
             page.change("Skeleton", True)
             page.until(lambda message: message["type"] == "TransformControlsMessage")
-            server.controls.choose_joint(2)
-            assert server.controls.joint == server.scene.chosen_joint == 2
-            server.controls.choose_joint(0)  # the root has sliders of its own
-            assert server.controls.joint == 2
-            server.controls.choose_joint(1)
+            server.controls.pose.choose_joint(2)
+            assert server.controls.pose.joint == server.scene.chosen_joint == 2
+            server.controls.pose.choose_joint(0)  # the root has sliders of its own
+            assert server.controls.pose.joint == 2
+            server.controls.pose.choose_joint(1)
             quarter = np.sqrt(0.5)
             page.expect()
             server.scene.turn_chosen(np.array([quarter, 0, 0, quarter]), is_over=True, client_id=0)

@@ -1,0 +1,99 @@
+"""The tab of motions: which one is played, how, and which frame is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from snarfcli.errors import UserError
+from snarfcli.viewer.inputs import on_user
+from snarfcli.viewer.picture import Picture
+from snarfcli.viewer.viewing import Viewing
+
+__all__ = ["NO_MOTION", "MotionTab"]
+
+NO_MOTION = "none"
+_SPEEDS = (0.1, 2.0)
+
+
+class MotionTab:
+    """The inputs of the motion, made where viser's next ones go.
+
+    Args:
+        gui: viser's.
+        viewing: what is shown.
+        motions: names of the motions that can be played.
+        load_motion: returns the motion of a name and its bone transforms; raises UserError.
+        first: name of the motion that is loaded already.
+    """
+
+    def __init__(
+        self,
+        gui: Any,
+        viewing: Viewing,
+        motions: Sequence[str],
+        load_motion: Callable[[str], tuple[Any, Any]],
+        first: str | None = None,
+    ) -> None:
+        self._viewing = viewing
+        self._load_motion = load_motion
+        self._is_playing: bool | None = None
+        self.notice: str | None = None
+        """Why the motion that was chosen last cannot be played, in one line; None if it can."""
+        self.names = gui.add_dropdown("Motion", (NO_MOTION, *motions), initial_value=first or NO_MOTION)
+        self._play = gui.add_button("Play", icon="player-play")
+        self._frame = gui.add_slider("Frame", 0, 1, 1, 0)
+        speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="times the motion's own pace")
+        loop = gui.add_checkbox("Loop", viewing.player.is_looping)
+        in_place = gui.add_checkbox(
+            "Stay in place", viewing.look.is_in_place, hint="the body keeps its height, but does not travel"
+        )
+        on_user(self.names, lambda handle, client: self.choose(handle.value))
+        self._play.on_click(lambda event: self._play_or_pause())
+        on_user(self._frame, lambda handle, client: self._seek(handle.value))
+        on_user(speed, lambda handle, client: viewing.change_speed(handle.value))
+        on_user(loop, lambda handle, client: viewing.change_looping(handle.value))
+        on_user(in_place, lambda handle, client: viewing.change_look(is_in_place=handle.value))
+        self._fit_frames()
+
+    def choose(self, name: str) -> None:
+        """Play the motion of a name."""
+        self.notice = None
+        try:
+            motion, transforms = (None, None) if name == NO_MOTION else self._load_motion(name)
+        except UserError as error:
+            self.notice = " ".join(str(error).split())
+            motion, transforms = None, None
+        self._viewing.load_motion(motion, transforms)
+        self._fit_frames()
+        self._viewing.play()
+
+    def follow(self, picture: Picture) -> None:
+        """Say on the button what it does."""
+        if picture.is_playing != self._is_playing:
+            self._is_playing = picture.is_playing
+            self._play.label = "Pause" if picture.is_playing else "Play"
+            self._play.icon = "player-pause" if picture.is_playing else "player-play"
+
+    def show_frame(self, frame: int) -> None:
+        """Set the slider to the number of a frame."""
+        if self._viewing.motion is not None:
+            self._frame.value = min(frame, int(self._frame.max))
+
+    def _fit_frames(self) -> None:
+        """Give the frame's slider the length of the motion."""
+        count = self._viewing.player.num_frames
+        self._frame.value = 0
+        self._frame.max = max(count - 1, 1)
+        self._frame.disabled = self._play.disabled = count < 2
+
+    def _play_or_pause(self) -> None:
+        if self._viewing.player.is_playing:
+            self._viewing.pause()
+        else:
+            self._viewing.play()
+
+    def _seek(self, frame: int) -> None:
+        if self._viewing.motion is not None:
+            self._viewing.pause()
+            self._viewing.seek(int(frame))

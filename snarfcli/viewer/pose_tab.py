@@ -1,0 +1,95 @@
+"""The tab of the pose: joint by joint, and the body as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from snarfcli.viewer.inputs import AngleSliders, on_user, rounded
+from snarfcli.viewer.joints import joint_labels, pose_file
+from snarfcli.viewer.picture import Picture
+from snarfcli.viewer.scene import Scene
+from snarfcli.viewer.viewing import Viewing
+
+__all__ = ["PoseTab"]
+
+_REACH_M = 3.0  # of the slider for the height, about the body's size of a person
+
+
+class PoseTab:
+    """The inputs of the pose, made where viser's next ones go.
+
+    Args:
+        gui: viser's.
+        viewing: what is shown.
+        scene: where it is shown, and the chosen joint is marked.
+    """
+
+    def __init__(self, gui: Any, viewing: Viewing, scene: Scene) -> None:
+        self._gui = gui
+        self._viewing = viewing
+        self._scene = scene
+        self._labels = joint_labels(viewing.body.skeleton)
+        self._seen_pose = -1  # which pose the sliders stand for
+        with gui.add_folder("Joint", visible=bool(self._labels)):  # a skeleton of one joint has its root only
+            joints = tuple(self._labels) or ("none",)
+            self._joint = gui.add_dropdown("Joint", joints, hint="or click one in the picture (Look: skeleton)")
+            self._angles = self._add_angles(lambda: self.joint)
+            buttons = gui.add_button_group("", ("Straight", "Mirror"), hint="mirror: turn the joint of the other side alike")
+        with gui.add_folder("Whole body"):
+            self._turns = self._add_angles(lambda: 0)
+            self._height = gui.add_slider("height", -_REACH_M, _REACH_M, 0.01, 0.0, hint="metres above its place at rest")
+        reset = gui.add_button("Reset pose", icon="refresh")
+        save = gui.add_button("Save pose", icon="download", hint="as .npz, which --pose reads again")
+        on_user(self._joint, lambda handle, client: self._mark_joint())
+        on_user(self._height, lambda handle, client: viewing.move_root(1, handle.value))
+        buttons.on_click(lambda event: self._press(event.target.value))
+        reset.on_click(lambda event: viewing.reset_pose())
+        save.on_click(lambda event: self._save(event.client))
+        self._mark_joint()
+
+    @property
+    def joint(self) -> int:
+        """Number of the chosen joint."""
+        return self._labels.get(self._joint.value, 0)
+
+    def choose_joint(self, joint: int) -> None:
+        """Choose a joint by its number, as by a click; the root is always at hand."""
+        label = next((label for label, number in self._labels.items() if number == joint), None)
+        if label is not None:
+            self._joint.value = label
+            self._mark_joint()
+
+    def follow(self, picture: Picture) -> bool:
+        """Bring the sliders up to date, which rest while a motion plays; return whether there was another pose."""
+        if picture.is_playing or picture.posed.number == self._seen_pose:
+            return False
+        self._seen_pose = picture.posed.number
+        self._angles.show(picture.posed.pose[self.joint])
+        self._turns.show(picture.posed.pose[0])
+        self._height.value = rounded(np.clip(picture.posed.translation[1], -_REACH_M, _REACH_M), 2)
+        return True
+
+    def _add_angles(self, joint: Callable[[], int]) -> AngleSliders:
+        viewing = self._viewing
+        return AngleSliders(
+            self._gui, lambda: viewing.pause().pose[joint()], lambda vector: viewing.turn_joint(joint(), vector)
+        )
+
+    def _mark_joint(self) -> None:
+        self._scene.chosen_joint = self.joint
+        self._seen_pose = -1
+        self._viewing.change_look()
+
+    def _press(self, button: str) -> None:
+        if button == "Mirror":
+            self._viewing.mirror_joint(self.joint)
+        else:
+            self._viewing.turn_joint(self.joint, np.zeros(3))
+
+    def _save(self, client: Any) -> None:
+        if client is not None:
+            posed = self._viewing.posed
+            client.send_file_download("pose.npz", pose_file(posed.pose, posed.translation), save_immediately=True)

@@ -35,7 +35,7 @@ class ToyCharacter:
         canonical[2, 1] = 0.2
         self.skeleton = Skeleton(tuple(f"bone_{j}" for j in range(JOINTS)), tuple(range(-1, JOINTS - 1)), rest, canonical)
         self.facts = {"subject": "worm"}
-        self.config = SimpleNamespace(model=SimpleNamespace(name="toy", condition=SimpleNamespace(name="global")))
+        self.config = SimpleNamespace(model=SimpleNamespace(name="toy"), condition=SimpleNamespace(name="global"))
         self.bulge, self.spread = bulge, spread
 
     def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:

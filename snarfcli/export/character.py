@@ -152,7 +152,7 @@ def character_surface(avatar: Avatar, options: CharacterOptions) -> SkinnedSurfa
         if options.triangles is not None and len(surface.mesh.faces) > options.triangles:
             log.info("decimating %d triangles to %d", len(surface.mesh.faces), options.triangles)
             surface = SkinnedSurface(avatar, options.resolution, mesh=_decimated(surface.mesh, options.triangles))
-        return _FixedSurface(surface) if avatar.config.model.condition.name == "none" else surface
+        return _FixedSurface(surface) if avatar.config.condition.name == "none" else surface
     except (EmptySurface, FullSurface) as error:
         raise UserError(f"this avatar has no surface to export: {error}; train it longer, or give another by ckpt=") from None
 

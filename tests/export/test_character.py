@@ -223,7 +223,8 @@ def test_other_readers_of_python(exported):
     scene = trimesh.load(path)
     (solid,) = scene.geometry.values()
     assert solid.faces.shape == surface.mesh.faces.shape
-    rig = read_gltf(path, frame_rate=FRAME_RATE)
+    rig = read_gltf(path)
+    assert [(clip.frame_rate, len(clip.world_from_joint)) for clip in rig.clips] == [(FRAME_RATE, 13), (60, 31)]
     assert [clip.name for clip in rig.clips] == ["wave", "fast"] and rig.names == tuple(f"bone_{j}" for j in range(JOINTS))
     reader = GlbReader(path)
     assert rig.clips[0].world_from_joint.shape == (13, JOINTS, 4, 4)
@@ -328,7 +329,7 @@ def test_a_shape_without_condition_is_looked_for_once(tmp_path, monkeypatch):
     monkeypatch.setattr(SkinnedSurface, "canonical_vertices", lambda self, pose: calls.append(0) or follow(self, pose))
     counts, files = [], []
     for name in ("global", "none"):
-        toy.config.model.condition.name = name
+        toy.config.condition.name = name
         export_character(toy, tmp_path / f"{name}.glb", [Clip(wave(5))], FEW, name="worm")
         surface = character_surface(toy, FEW)
         clip = Clip(wave(5))

@@ -39,7 +39,7 @@ class _Skin:
     """[J, 4, 4] from the frame in which the mesh is stored to the joint's own."""
 
 
-def read_gltf(path: str | Path, *, frame_rate: float = 30.0) -> Rig:
+def read_gltf(path: str | Path, *, frame_rate: float | None = None) -> Rig:
     """Read the joints, the motions and the mesh of a `.glb` or `.gltf` file.
 
     Where things are. A skin's joint moves a vertex, as stored, by `world_from_joint(t) @ inverse_bind`; the transform of the
@@ -58,14 +58,15 @@ def read_gltf(path: str | Path, *, frame_rate: float = 30.0) -> Rig:
 
     Args:
         path: the file; its buffers lie in it or beside it.
-        frame_rate: at which animations are sampled, frames a second, from the first key to the last.
+        frame_rate: at which animations are sampled, frames a second, from the first key to the last; None for each one's own
+            (`extras.frame_rate`, as this package writes it, or what equally spaced keys show), and 30 where it has none.
 
     Raises:
         UserError: the file is missing, damaged, compressed (Draco, meshopt) or absurdly large, or it holds nothing that moves,
             or joints of scale zero.
         ValueError: `frame_rate` is not positive.
     """
-    if not frame_rate > 0:
+    if frame_rate is not None and not frame_rate > 0:
         raise ValueError(f"frame_rate: wanted a positive number, got {frame_rate}")
     file = GltfFile(path)
     tree = NodeTree(file)
@@ -100,7 +101,7 @@ def read_gltf(path: str | Path, *, frame_rate: float = 30.0) -> Rig:
             for column, joint in enumerate(joints):
                 poses[:, column] = worlds[joint]
             _check_transforms(file, poses, names, f" in clip {name}")
-            clips.append(Clip(name, float(frame_rate), poses))
+            clips.append(Clip(name, animation.frame_rate, poses))
         whole = welded(join_pieces(pieces))
         mesh = None
         if len(whole.faces):

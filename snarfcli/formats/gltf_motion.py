@@ -20,6 +20,12 @@ _MAX_CHANNELS = 30_000
 _MAX_FRAMES = 100_000
 # Of all animations together: frames times channels. A minute of 100 joints at 30 frames a second is half a million.
 _MAX_SAMPLES = 5_000_000
+_MAX_NODE_FRAMES = 1_500_000  # less than `read_gltf` takes
+_USUAL_RATE = 30.0
+_SAID_RATES = (1.0, 1000.0)
+# What is keyed more rarely is keyed by hand, and what lies between the keys belongs to the motion.
+_SHOWN_RATES = (10.0, 1000.0)
+_OFF_A_FRAME = 0.05  # frames; float32 is off by 0.015 in the fiftieth minute at 60 a second
 # Below it a step counts as none: times are stored as float32.
 _EPSILON = 1e-5
 
@@ -30,58 +36,140 @@ class Animation:
 
     name: str
     """Its name in the file, or empty."""
+    frame_rate: float
+    """Frames a second."""
     num_frames: int
     """T, at equal times from the first key to the last."""
     nodes: dict[int, dict[str, NDArray[np.float64]]]
     """For each node that moves, some of `translation` [T, 3], `rotation` [T, 4] (unit quaternions, x y z w), `scale` [T, 3]."""
 
 
-def read_animations(file: GltfFile, frame_rate: float) -> list[Animation]:
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """What is known of an animation before it is sampled."""
+
+    name: str
+    what: str
+    """How messages call it."""
+    targets: list[tuple[int, str, dict[str, Any]]]
+    """Node, path and sampler of each channel."""
+    times: list[NDArray[np.float64]]
+    """Times of the keys of each channel, seconds."""
+    own_rate: float | None
+    """Frames a second on which all keys lie, if that is known."""
+
+    @property
+    def start(self) -> float:
+        """Time of the first key, seconds."""
+        return min(times[0] for times in self.times)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first key to the last."""
+        return max(times[-1] for times in self.times) - self.start
+
+    def num_frames(self, frame_rate: float) -> int:
+        """Return how many frames there are, the last at most at the last key."""
+        if frame_rate == self.own_rate:  # a long time's float32 may be half a frame early
+            return round(self.duration * frame_rate) + 1
+        return int(self.duration * frame_rate + _EPSILON * frame_rate + 1e-6) + 1
+
+
+def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[Animation]:
     """Sample every animation that moves a node; those of morph targets are left out.
 
     Args:
         file: the file.
-        frame_rate: frames a second.
+        frame_rate: frames a second; None for each animation's own, or 30 where none is known, or where it is more than that
+            and makes too many frames.
 
     Raises:
         UserError: times that do not increase, broken numbers, or far too many frames.
     """
-    found = []
+    tracks = _read_tracks(file)
+    rates = [frame_rate or track.own_rate or _USUAL_RATE for track in tracks]
+    if frame_rate is None and not _affordable(tracks, rates, len(file.items("nodes"))):
+        rates = [min(rate, _USUAL_RATE) for rate in rates]
+    found, samples = [], 0
+    for track, rate in zip(tracks, rates, strict=True):
+        start, duration = track.start, track.duration
+        if not duration * rate < _MAX_FRAMES:
+            file.fail(f"{track.what} lasts {duration:.6g} s, over {_MAX_FRAMES} frames at {rate:g} a second; cut it")
+        frames = track.num_frames(rate)
+        samples += frames * len(track.targets)
+        if samples > _MAX_SAMPLES:
+            file.fail(f"its animations have over {_MAX_SAMPLES} samples at {rate:g} frames a second; export fewer")
+        at = start + np.minimum(np.arange(frames) / rate, duration)
+        nodes: dict[int, dict[str, NDArray[np.float64]]] = {}
+        for (node, path, sampler), keys in zip(track.targets, track.times, strict=True):
+            values, mode = _read_values(file, sampler, path, len(keys), track.what)
+            sampled = _sample(keys, values, mode, at, path == "rotation")
+            if path == "rotation":
+                length = np.linalg.norm(sampled, axis=1, keepdims=True)
+                if not (length > 1e-12).all():
+                    file.fail(f"{track.what}: a rotation of node {node} is a zero quaternion; export it again")
+                sampled = sampled / length
+            nodes.setdefault(node, {})[path] = sampled
+        found.append(Animation(track.name, float(rate), frames, nodes))
+    return found
+
+
+def _read_tracks(file: GltfFile) -> list[_Track]:
+    """Read the channels and times of every animation that moves a node."""
     animations = file.items("animations")
     channels = [file.objects(a, "channels", f"animation {n}") for n, a in enumerate(animations)]
     if sum(map(len, channels)) > _MAX_CHANNELS:
         file.fail(f"its animations have over {_MAX_CHANNELS} channels; export fewer of them")
-    samples = 0
+    tracks = []
     for number, animation in enumerate(animations):
         name = animation.get("name")
         name = name if isinstance(name, str) else ""
         what = f"animation {number} ({name!a:.40})" if name else f"animation {number}"
         samplers = file.objects(animation, "samplers", what)
         targets = [target for channel in channels[number] if (target := _target(file, channel, samplers, what))]
-        if not targets:
-            continue
-        times = [_read_times(file, sampler, what) for _, _, sampler in targets]
-        start = min(t[0] for t in times)
-        duration = max(t[-1] for t in times) - start
-        if not duration * frame_rate < _MAX_FRAMES:
-            file.fail(f"{what} lasts {duration:.6g} s, over {_MAX_FRAMES} frames at {frame_rate:g} a second; cut it")
-        frames = int(duration * frame_rate + _EPSILON * frame_rate + 1e-6) + 1
-        samples += frames * len(targets)
-        if samples > _MAX_SAMPLES:
-            file.fail(f"its animations have over {_MAX_SAMPLES} samples at {frame_rate:g} frames a second; export fewer")
-        at = start + np.minimum(np.arange(frames) / frame_rate, duration)
-        nodes: dict[int, dict[str, NDArray[np.float64]]] = {}
-        for (node, path, sampler), keys in zip(targets, times, strict=True):
-            values, mode = _read_values(file, sampler, path, len(keys), what)
-            sampled = _sample(keys, values, mode, at, path == "rotation")
-            if path == "rotation":
-                length = np.linalg.norm(sampled, axis=1, keepdims=True)
-                if not (length > 1e-12).all():
-                    file.fail(f"{what}: a rotation of node {node} is a zero quaternion; export it again")
-                sampled = sampled / length
-            nodes.setdefault(node, {})[path] = sampled
-        found.append(Animation(name, frames, nodes))
-    return found
+        if targets:
+            times = [_read_times(file, sampler, what) for _, _, sampler in targets]
+            extras = animation.get("extras")
+            said = extras.get("frame_rate") if isinstance(extras, dict) else None
+            tracks.append(_Track(name, what, targets, times, _own_rate(times, said)))
+    return tracks
+
+
+def _own_rate(times: list[NDArray[np.float64]], said: Any) -> float | None:
+    """Return the frames a second on which all keys lie: what the file says, or what equal steps show; None for neither."""
+    if type(said) in (int, float) and _SAID_RATES[0] <= said <= _SAID_RATES[1] and _fits(times, said):
+        return float(said)
+    keys = max(times, key=len)
+    length = keys[-1] - keys[0]
+    if len(keys) < 3 or not length > 0:
+        return None
+    rate = float((len(keys) - 1) / length)
+    rate = round(rate) if abs(rate - round(rate)) < 1e-3 else rate
+    return float(rate) if _SHOWN_RATES[0] <= rate <= _SHOWN_RATES[1] and _fits(times, rate) else None
+
+
+def _fits(times: list[NDArray[np.float64]], rate: float) -> bool:
+    """Return whether all keys lie on frames, and no frame is without a key unless only ends have keys."""
+    start = min(keys[0] for keys in times)
+    last = (max(keys[-1] for keys in times) - start) * rate
+    if not last < _MAX_FRAMES:
+        return False
+    taken = np.zeros(round(last) + 1, dtype=bool)
+    for keys in times:
+        frames = (keys - start) * rate
+        nearest = np.rint(frames)
+        if (np.abs(frames - nearest) > _OFF_A_FRAME).any():
+            return False
+        taken[nearest.astype(np.int64)] = True
+    return bool(taken.all()) or max(map(len, times)) <= 2
+
+
+def _affordable(tracks: list[_Track], rates: list[float], num_nodes: int) -> bool:
+    """Return whether these rates stay within what this module and `read_gltf` take; the usual rate may with more."""
+    frames = [track.duration * rate + 20 for track, rate in zip(tracks, rates, strict=True)]
+    samples = sum(count * len(track.targets) for count, track in zip(frames, tracks, strict=True))
+    most = max(frames, default=0)
+    return most < _MAX_FRAMES and samples < _MAX_SAMPLES and sum(frames) * num_nodes < _MAX_NODE_FRAMES
 
 
 def _target(

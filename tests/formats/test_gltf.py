@@ -421,3 +421,60 @@ def test_missing_file_and_folder_are_refused(tmp_path):
         read_gltf(tmp_path / "file.glb")
     with pytest.raises(UserError, match="is not a file"):
         read_gltf(tmp_path)
+
+
+def _turning(times, extras=None, *, ends=None, count=1):
+    """Two bones, the upper of which turns, with keys at these times; the other has keys at `ends`."""
+    builder = _two_bones()
+    times = np.asarray(times, np.float64)
+    angle = np.linspace(0, 1, len(times)) ** 2
+    spin = np.stack([0 * angle, 0 * angle, np.sin(angle), np.cos(angle)], 1)
+    samplers = [{"input": builder.array(times), "output": builder.array(spin)}]
+    channels = [{"sampler": 0, "target": {"node": 1, "path": "rotation"}}]
+    if ends is not None:
+        samplers.append({"input": builder.array(ends), "output": builder.array(np.zeros((len(ends), 3)))})
+        channels.append({"sampler": 1, "target": {"node": 3, "path": "translation"}})
+    builder.root["animations"] = [{"samplers": samplers, "channels": channels, "extras": extras}] * count
+    return builder
+
+
+@pytest.mark.parametrize(
+    ("times", "extras", "ends", "rate", "frames"),
+    [
+        (np.arange(50) / 24, None, None, 24, 50),  # equal steps show the rate
+        (3 + np.arange(50) / 24, None, [3, 3 + 49 / 24], 24, 50),
+        (np.arange(121) / 120, None, None, 120, 121),
+        (np.arange(50) * 1001 / 30000, None, None, 30000 / 1001, 50),
+        (np.arange(400_00) / 24, None, None, 24, 400_00),  # long ago, as float32
+        ([0, 0.5], {"frame_rate": 24, "frames": 13}, None, 24, 13),  # stands still: what the file says
+        (np.arange(7) / 5, {"frame_rate": 5.0}, None, 5, 7),
+        ([0.0], {"frame_rate": 24}, None, 24, 1),
+        ([0, 0.5, 1], None, None, 30, 31),  # keyed by hand
+        ([0, 0.1, 0.15, 1], None, None, 30, 31),
+        (np.arange(50) / 24, None, [0, 0.03], 30, 62),
+        (np.arange(50) / 24, None, [0, 9], 30, 271),
+        # what a file may say without being believed
+        (np.arange(25) / 24, {"frame_rate": 23.0}, None, 24, 25),
+        (np.arange(25) / 24, {"frame_rate": 960}, None, 24, 25),  # all keys lie on frames, but few frames have any
+        (np.arange(25) / 24, {"frame_rate": 0.1}, None, 24, 25),
+        ([0, 0.5], {"frame_rate": 1e9}, None, 30, 16),
+        ([0, 0.5], {"frame_rate": 10**400}, None, 30, 16),
+        ([0, 0.5], {"frame_rate": -24}, None, 30, 16),
+        ([0, 0.5], {"frame_rate": float("nan")}, None, 30, 16),
+        ([0, 0.5], {"frame_rate": "24"}, None, 30, 16),
+        ([0, 0.5], {"frame_rate": True}, None, 30, 16),
+        ([0, 0.5], {"frame_rate": [24]}, None, 30, 16),
+        ([0, 0.5], [24], None, 30, 16),
+        ([0, 1000], {"frame_rate": 1000}, None, 30, 30001),  # too many
+    ],
+)  # fmt: skip
+def test_clips_keep_their_own_frame_rate(tmp_path, times, extras, ends, rate, frames):
+    (clip,) = _read(tmp_path, _turning(times, extras, ends=ends)).clips
+    assert clip.frame_rate == pytest.approx(rate, rel=1e-6) and len(clip.world_from_joint) == frames
+
+
+def test_a_rate_that_makes_too_many_samples_gives_way_to_the_usual(tmp_path):
+    clips = _read(tmp_path, _turning([0, 90], {"frame_rate": 1000}, count=4)).clips
+    assert [(clip.frame_rate, len(clip.world_from_joint)) for clip in clips] == [(30, 2701)] * 4
+    clips = _read(tmp_path, _turning([0, 90], {"frame_rate": 24}, count=4), frame_rate=10).clips
+    assert [(clip.frame_rate, len(clip.world_from_joint)) for clip in clips] == [(10, 901)] * 4

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from snarfcli.export.character import Character, CharacterClip
 from snarfcli.export.glb import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbBuilder
 from snarfcli.export.meshes import weights_to_colors
+from snarfcli.export.render import from_srgb
 from snarfcli.export.rig import decompose, local_frames
 from snarfcli.meshing.mesh import vertex_normals
 
@@ -186,9 +187,7 @@ def _moving(clips: Sequence[CharacterClip], path: str, rest: NDArray[np.float64]
 
 def _linear(colors: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return sRGB colours [V, 3] as linear ones with alpha, [V, 4] from 0 to 65535 (glTF 2.0, 3.7.2.1: linear)."""
-    share = colors / 255.0
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return np.rint(65535 * np.hstack([linear, np.ones((len(colors), 1))]))
+    return np.rint(65535 * np.hstack([from_srgb(colors), np.ones((len(colors), 1))]))
 
 
 def _units(normals: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -66,7 +66,8 @@ def animate_config(config: TrainConfig, pose: Path, **changes) -> animate.Animat
         ckpt=None, pose=str(pose), up="y", hands="rest", mapping=None, clip=None, motion=None, motion_seed=0,
         motion_frame_rate=30.0, start=0, stop=None, step=1, frame_rate=None, max_frames=None, in_place=False,
         surface="field", resolution=24, keep_share=0.01, meshes=True, format="ply", weight_colors=False, video=False,
-        video_size="64", azimuth_deg=0.0, elevation_deg=0.0, output=None, overwrite=False, device="cpu", threads=None,
+        video_size="64", views=["front"], azimuth_deg=0.0, elevation_deg=0.0, camera="still", turntable="false", beside=[],
+        processes="1", output=None, overwrite=False, device="cpu", threads=None,
     )  # fmt: skip
     return replace(settings, **changes)
 

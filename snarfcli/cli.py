@@ -20,6 +20,8 @@ from snarfcli.settings import (
     describe,
     group_options,
     group_schemas,
+    in_brackets,
+    list_settings,
     preset_groups,
     quote,
     quote_items,
@@ -201,6 +203,9 @@ def _run(command: Command, arguments: list[str]) -> int:
     overrides = _translate_flags(command, arguments)
     module = importlib.import_module(f"snarfcli.commands.{command.module}")
     schema = getattr(module, command.schema)
+    if not {"-m", "--multirun"} & set(overrides):  # there, commas are between jobs
+        lists = list_settings(schema)
+        overrides = [argument if argument.startswith("-") else in_brackets(argument, lists) for argument in overrides]
     settings = [argument for argument in overrides if not argument.startswith("-") and "=" in argument]
     check_overrides(settings, schema, command.name)
     presets = preset_groups(schema, command.name)
@@ -364,6 +369,10 @@ def _config_message(chain: list[BaseException]) -> str:
     key = re.search(r"full_key: ([\w.]+)", text)
     if unfit and key:
         return f"{key.group(1)} wants {_TYPE_NAMES.get(unfit.group(2), unfit.group(2))}, got '{unfit.group(1)}'"
+    several = re.search(r"override (\S+?)=(\S*).*Cannot convert 'list' to string", text)
+    if several:
+        one = several.group(2).strip("[]':").split(",")[0]
+        return f"{several.group(1)} takes one value, got a list; write {several.group(1)}={one}"
     single = re.search(r"override (\S+?)=(\S*).*is not a ListConfig", text)
     if single:
         return f"{single.group(1)} wants a list, got {single.group(2)}; write {single.group(1)}=[{single.group(2)}]"
@@ -397,7 +406,13 @@ def _help(command: Command) -> str:
     module = importlib.import_module(f"snarfcli.commands.{command.module}")
     schema = getattr(module, command.schema)
     lines = [f"snarf {command.name}: {command.summary}", "", f"example: {command.example}", ""]
-    flags = command.flags | {"--cfg job": "print the configuration and stop", "-m": "a run for each of comma-separated values"}
+    flags = {}
+    for flag, override in command.flags.items():
+        setting, _, value = override.partition("=")
+        times = "; may be given several times" if value == "[{}]" else ""
+        flags[f"{flag} VALUE" if "{}" in value else flag] = f"{setting}=VALUE{times}" if "{}" in value else override
+    flags["--cfg job"] = "print all settings with their values, and stop"
+    flags["-m"] = "a run for each of comma-separated values"
     lines += ["flags:"] + [f"  {flag:<21} {meaning}" for flag, meaning in flags.items()] + [""]
     choices = {name: name for name in group_schemas(schema)} | preset_groups(schema, command.name)
     options = {name: group_options(group) for name, group in choices.items()}

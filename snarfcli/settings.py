@@ -8,7 +8,7 @@ import inspect
 import re
 import textwrap
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ __all__ = [
     "describe",
     "group_options",
     "group_schemas",
+    "in_brackets",
+    "list_settings",
     "preset_groups",
     "quote",
     "quote_items",
@@ -77,6 +79,26 @@ def setting_names(schema: type, prefix: str = "") -> list[str]:
         name = prefix + field.name
         names += [name, *setting_names(nested[field.name], name + ".")] if field.name in nested else [name]
     return names
+
+
+def list_settings(schema: type, prefix: str = "") -> set[str]:
+    """Return the dotted names of all settings of a dataclass that are lists, or may be."""
+    nested, hints = group_schemas(schema), typing.get_type_hints(schema)
+    names: set[str] = set()
+    for field in dataclasses.fields(schema):
+        kinds = (hints[field.name], *typing.get_args(hints[field.name]))
+        if any(typing.get_origin(kind) is list for kind in kinds):
+            names.add(prefix + field.name)
+        elif field.name in nested:
+            names |= list_settings(nested[field.name], f"{prefix}{field.name}.")
+    return names
+
+
+def in_brackets(override: str, lists: Collection[str]) -> str:
+    """Return an override of a setting that is a list with its brackets: views=front,left is views=[front,left]."""
+    name, _, value = override.partition("=")
+    is_bare = name in lists and value not in ("", "null") and not value.startswith("[") and "${" not in value
+    return f"{name}=[{value}]" if is_bare else override
 
 
 def check_overrides(overrides: Sequence[str], schema: type, command: str = "") -> None:

@@ -158,7 +158,14 @@ def test_setting_names_are_dotted():
     assert {"subject", "training", "training.steps", "search.init_bones"} <= set(names)
 
 
-def test_a_list_given_as_one_word_is_told_how_to_write_it(capsys):
-    assert cli.main(["reproduce", "table1", "--dry-run", "subjects=50002"]) == 2
-    error = capsys.readouterr().err
-    assert error == "snarf reproduce: subjects wants a list, got 50002; write subjects=[50002]\n"
+def test_a_list_needs_no_brackets(capsys):
+    for value, wanted in (("front", ["front"]), ("front,left", ["front", "left"]), ("[back]", ["back"])):
+        code, out, _ = run(capsys, "animate", f"views={value}", "--cfg", "job")
+        assert code == 0 and "views:\n" + "".join(f"- {name}\n" for name in wanted) in out
+    code, out, _ = run(capsys, "reproduce", "table1", "subjects=50002,50004", "--cfg", "job")
+    assert code == 0 and "subjects:\n- '50002'\n- '50004'\n" in out
+
+
+def test_one_value_given_as_a_list_is_told_how_to_write_it(capsys):
+    code, _, error = run(capsys, "animate", "motion=[lunges,splits]")
+    assert code == 2 and error == "snarf animate: motion takes one value, got a list; write motion=lunges\n"

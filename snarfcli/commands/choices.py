@@ -21,10 +21,19 @@ from snarfcli.motions.layouts import HANDS, SMPL, layout_of
 from snarfcli.motions.world import UPS
 from snarfcli.runs import choose_device, find_avatar, run_folder, set_threads
 
-__all__ = ["AvatarChoice", "ChosenMotion", "MotionChoice", "check_motion_choice", "choose_motion", "load_chosen_avatar"]
+__all__ = [
+    "BUILTIN_MOTIONS",
+    "AvatarChoice",
+    "ChosenMotion",
+    "MotionChoice",
+    "check_motion_choice",
+    "choose_motion",
+    "load_chosen_avatar",
+]
 
 _MOTION = "jumping_jacks"
-_BUILTIN_MOTIONS = (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES)
+BUILTIN_MOTIONS = (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES)
+"""Names of the motions that need no file."""
 _FRAME_RATES = (1.0, 1000.0)
 
 
@@ -146,8 +155,9 @@ def choose_motion(
     whole, transforms = _read(choice, avatar, skeleton, pose, motion)
     numbers = list(range(*slice(choice.start, choice.stop, choice.step).indices(whole.num_frames)))
     if not numbers:
+        stop = "null" if choice.stop is None else choice.stop
         raise UserError(
-            f"start={choice.start}, stop={choice.stop} leave no frame: {whole.name} has frames 0 to {whole.num_frames - 1}"
+            f"start={choice.start}, stop={stop} leave no frame: {whole.name} has frames 0 to {whole.num_frames - 1}"
         )
     taken = replace(
         whole,
@@ -181,7 +191,7 @@ def _read(
         motion = read_motion(pose, skeleton, up=choice.up, hands=choice.hands, mapping=choice.mapping, clip=choice.clip)
         return motion, None
     is_smpl = layout_of(skeleton) == SMPL
-    if not is_smpl and avatar.data.name != "builtin" and name not in _BUILTIN_MOTIONS:
+    if not is_smpl and avatar.data.name != "builtin" and name not in BUILTIN_MOTIONS:
         return stored_motion(avatar.data_root, avatar.data.name, avatar.subject, name, skeleton)
     motion = builtin_motion(name or _MOTION, choice.motion_seed, frame_rate=choice.motion_frame_rate)
     if not is_smpl:

@@ -14,6 +14,7 @@ from omegaconf import MISSING
 
 from snarfcli.checks import check_choice
 from snarfcli.commands.choices import (
+    BUILTIN_MOTIONS,
     AvatarChoice,
     MotionChoice,
     check_motion_choice,
@@ -24,6 +25,7 @@ from snarfcli.errors import UserError
 from snarfcli.export.blender import BLENDER_FORMATS, convert, find_blender
 from snarfcli.export.character import CharacterOptions, character_surface, check_avatar, check_options
 from snarfcli.export.exporting import ExportReport, check_output, export_character
+from snarfcli.export.ground import HEIGHTS, on_ground
 from snarfcli.export.meshes import MESH_WRITERS
 from snarfcli.export.rig import Clip
 from snarfcli.export.sequence import atomic_folder, check_folder, write_sequence
@@ -36,6 +38,7 @@ __all__ = ["ExportConfig", "run"]
 
 log = logging.getLogger(__name__)
 
+_GROUND_RESOLUTION = 128
 _FORMATS = ("glb", *MESH_WRITERS, *BLENDER_FORMATS)
 _RECORD = "export.json"
 
@@ -61,6 +64,9 @@ class ExportConfig(MotionChoice, AvatarChoice):
     """Voxels along the longest side of the canonical box, from which the mesh is made."""
     weight_colors: bool = MISSING
     """Whether vertices are coloured by their skinning weights."""
+    height: str = MISSING
+    """How high the clips are: ground (the lowest point of each at y = 0), file (as their motions have it), or auto: built-in
+    motions on the ground, pose files as they are."""
     output: str | None = MISSING
     """File, or folder for ply and obj; null for export/<subject>.<format> beside the avatar."""
     overwrite: bool = MISSING
@@ -112,6 +118,7 @@ def run(config: ExportConfig) -> int:
 def _check(config: ExportConfig) -> CharacterOptions:
     """Refuse settings that cannot be used, before any work starts; return what the character may cost."""
     check_choice("format", config.format, _FORMATS)
+    check_choice("height", config.height, HEIGHTS)
     options = CharacterOptions(
         triangles=config.triangles,
         influences=config.influences,
@@ -160,13 +167,19 @@ def _record(config: ExportConfig, output: Path) -> Path:
 
 
 def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:
-    """Read all motions."""
+    """Read all motions, and put those on the ground that should stand there."""
     wanted: list[tuple[str | None, str | None]] = [(pose, None) for pose in config.pose or ()]
     wanted += [(None, motion) for motion in config.motion or ()]
     clips = []
     for pose, motion in wanted or [(None, None)]:
         chosen = choose_motion(config, config, avatar.skeleton, pose, motion)
-        clips.append(Clip(chosen.motion, chosen.bone_transforms))
+        clip = Clip(chosen.motion, chosen.bone_transforms)
+        is_builtin = pose is None and clip.bone_transforms is None and clip.motion.name in BUILTIN_MOTIONS
+        if config.height == "ground" or (config.height == "auto" and is_builtin):
+            mesh = avatar.skinned_surface(min(_GROUND_RESOLUTION, config.resolution)).mesh
+            clip, up = on_ground(mesh, avatar.skeleton, clip)
+            log.info("%s stands on y = 0: moved by %.3f m", clip.motion.name, up)
+        clips.append(clip)
     return clips
 
 

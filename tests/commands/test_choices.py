@@ -86,7 +86,7 @@ def test_stretching_joints_are_kept_and_cannot_be_resampled(skeleton, monkeypatc
 
 
 def test_what_cannot_be_used_is_refused(skeleton, walk):
-    with pytest.raises(UserError, match="start=90, stop=None leave no frame: walk has frames 0 to 24"):
+    with pytest.raises(UserError, match="start=90, stop=null leave no frame: walk has frames 0 to 24"):
         choose(skeleton, walk, start=90)
     for changes, message in (
         ({"frame_rate": 0.0}, "frame_rate must be between 1.0 and 1000.0, got 0.0"),

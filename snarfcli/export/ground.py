@@ -15,7 +15,7 @@ from snarfcli.meshing.skinned import skin_vertices
 __all__ = ["HEIGHTS", "lowest_point", "on_ground"]
 
 HEIGHTS = ("auto", "ground", "file")
-"""How high a clip is: `ground`, its lowest point at y = 0; `file`, as its motion has it; `auto`, built-in ones on the ground."""
+"""How high a clip is: `ground`, its lowest point at y = 0; `file`, as its motion has it; `auto`, only built-in ones there."""
 
 _MOST_FRAMES = 200  # of a clip, evenly spread: a foot is on the ground for longer
 

@@ -305,7 +305,7 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"keep_share": 1.5}, "keep_share must be between 0 and 1, got 1.5"),
         ({"step": 0}, "step must be at least 1"),
         ({"max_frames": 0}, "max_frames must be at least 1"),
-        ({"start": 6}, "start=6, stop=None leave no frame: wave has frames 0 to 5"),
+        ({"start": 6}, "start=6, stop=null leave no frame: wave has frames 0 to 5"),
         ({"meshes": False, "video": False}, "nothing to make"),
         ({"video_size": "large"}, "video_size must be a number such as 512 or 1280x720"),
         ({"video_size": "9000"}, "video_size must be"),

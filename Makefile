@@ -46,6 +46,7 @@ sanitize: $(INSTALLED)
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
 
+bench: export OMP_WAIT_POLICY = PASSIVE   # as the commands have it
 bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_search.py
 	$(VENV)/bin/python benchmarks/bm_data.py

@@ -46,7 +46,8 @@ sanitize: $(INSTALLED)
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
 
-bench: export OMP_WAIT_POLICY = PASSIVE   # as the commands have it
+# The commands set this too: else PyTorch's idle threads keep the cores from the native library.
+bench: export OMP_WAIT_POLICY = PASSIVE
 bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_search.py
 	$(VENV)/bin/python benchmarks/bm_data.py

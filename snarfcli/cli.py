@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import errno
 import importlib
 import logging
 import os
-import re
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import snarfcli
+from snarfcli.command_list import COMMAND_LIST, COMMANDS, Command
 from snarfcli.errors import UserError, nearest
+from snarfcli.messages import user_message
 from snarfcli.settings import (
     check_overrides,
     config_folder,
@@ -34,116 +33,7 @@ log = logging.getLogger(__name__)
 EXIT_USER_ERROR = 2
 EXIT_INTERRUPTED = 130
 
-
-@dataclass(frozen=True)
-class Command:
-    """One subcommand."""
-
-    name: str
-    """Name of the configuration file, and of the command on the command line."""
-    module: str
-    """Module below `snarfcli.commands` with `run` and the configuration's dataclass."""
-    schema: str
-    """Name of that dataclass."""
-    summary: str
-    """What it does, in one line."""
-    example: str
-    """A call that works on a fresh machine once the commands before it have run."""
-    flags: dict[str, str]
-    """Flags and the overrides they stand for; `{}` takes the flag's value, `[{}]` those of all times that it is given."""
-    positional: str | None = None
-    """Setting whose value may stand first, without its name."""
-    lists_of_settings: tuple[str, ...] = ()
-    """Settings whose value is a list of settings."""
-    folder: str = ""
-    """Folder of its configuration below conf/. Outside of it there are groups, whose names its settings may have therefore."""
-    is_hidden: bool = False
-    """Whether it is only for the program itself."""
-
-
-_COMMANDS = (
-    Command(
-        "preprocess",
-        "preprocess",
-        "PreprocessConfig",
-        "sample occupancies from posed meshes",
-        "snarf preprocess subject=50002",
-        {},
-    ),
-    Command(
-        "train",
-        "train",
-        "TrainConfig",
-        "train the avatar of one subject",
-        "snarf train subject=50002",
-        {"--resume": "resume=true"},
-    ),
-    Command(
-        "eval",
-        "evaluate",
-        "EvalConfig",
-        "IoU on the held-out motion, or on out-of-distribution poses (also: evaluate)",
-        "snarf eval --ood subject=50002",
-        {"--ood": "split=ood"},
-    ),
-    Command(
-        "animate",
-        "animate",
-        "AnimateConfig",
-        "posed meshes and a video of a motion",
-        "snarf animate --pose seq.npz subject=50002",
-        {"--pose": "pose={}"},
-    ),
-    Command(
-        "export",
-        "export",
-        "ExportConfig",
-        "a rigged, animated character for other programs: glb, fbx, usd, or a mesh a frame",
-        "snarf export --pose a.npz --pose b.bvh subject=50002",
-        {"--pose": "pose=[{}]"},
-    ),
-    Command(
-        "view",
-        "view",
-        "ViewConfig",
-        "an avatar in the browser: pose it, play motions",
-        "snarf view --pose seq.npz subject=50002",
-        {"--pose": "pose=[{}]", "--port": "port={}", "--host": "host={}", "--no-open": "open=false"},
-    ),
-    Command(
-        "doctor",
-        "doctor",
-        "DoctorConfig",
-        "versions, what runs natively and what does not, and why",
-        "snarf doctor",
-        {},
-    ),
-    Command(
-        "reproduce",
-        "reproduce",
-        "ReproduceConfig",
-        "the papers' tables and figures: table1, table2, ablations, stick2d, clothed or all",
-        "snarf reproduce table1 subjects=[50002,50004] training=quick",
-        {"--dry-run": "dry_run=true"},
-        positional="what",
-        lists_of_settings=("extra", "launcher_settings"),
-        folder="reproduce",
-    ),
-    Command(
-        "reproduce_job",
-        "reproduce_job",
-        "ReproduceJobConfig",
-        "one run of a plan, started by Hydra's launchers",
-        "snarf reproduce_job plan=plan.json job=0",
-        {},
-        folder="reproduce",
-        is_hidden=True,
-    ),
-)
-COMMANDS = {command.name: command for command in _COMMANDS} | {"evaluate": _COMMANDS[2]}
-
 _HYDRA_FLAGS = ("-m", "--multirun", "--cfg", "-c", "--resolve", "--package", "-p", "--info", "-i", "--hydra-help")
-
 
 # Run folders are the commands' own business: Hydra writes nothing, changes no folder and leaves logging alone.
 _HYDRA_SETTINGS = (
@@ -188,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _report(command: Command, error: Exception) -> int:
     """Print an error that a user can mend as one line and return its exit code; raise any other again."""
-    message = _user_message(error)
+    message = user_message(error)
     if message is None:
         raise error
     print(f"snarf {command.name}: {message}", file=sys.stderr)
@@ -313,76 +203,6 @@ def register_schemas(name: str, schema: type) -> None:
         store.store(group="schema", name=group, node=node)
 
 
-# ---------------------------------------------------------------- messages
-def _user_message(error: BaseException) -> str | None:
-    """Return one line for an error that a user can mend, or None for a fault of the program."""
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
-    chain = _chain(error)
-    for link in chain:
-        if isinstance(link, UserError):
-            return _one_line(link)
-    for link in chain:
-        if isinstance(link, OSError) and not isinstance(link, (ConnectionError, ChildProcessError)):
-            return _file_message(link)
-    if isinstance(error, OmegaConfBaseException | HydraException):
-        return _config_message(chain)
-    return None
-
-
-def _chain(error: BaseException) -> list[BaseException]:
-    """Return the error and its causes."""
-    links: list[BaseException] = []
-    current: BaseException | None = error
-    while current is not None and current not in links:
-        links.append(current)
-        current = current.__cause__ or current.__context__
-    return links
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
-
-
-def _file_message(error: OSError) -> str:
-    """Return what went wrong with a file and what to do."""
-    name = error.filename2 or error.filename or "a file"
-    advice = {
-        errno.ENOSPC: "the disk is full; make room, then run the command again: it goes on where it stopped",
-        errno.EDQUOT: "the disk quota is used up; make room, then run the command again",
-        errno.EACCES: "no permission; choose another folder with output_root=... or data_root=...",
-        errno.EPERM: "no permission; choose another folder with output_root=... or data_root=...",
-        errno.EROFS: "the file system is read-only; choose another folder with output_root=... or data_root=...",
-        errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
-        errno.EISDIR: "is a folder, not a file",
-        errno.EEXIST: "is a file, not a folder; choose another folder",
-        errno.ENOENT: "is not there and cannot be made; choose another folder or file",
-    }
-    return f"{name}: {advice.get(error.errno or 0, error.strerror or _one_line(error))}"
-
-
-def _config_message(chain: list[BaseException]) -> str:
-    """Return one line for a setting whose value does not fit."""
-    text = " ".join(_one_line(link) for link in chain)
-    unfit = re.search(r"Value '([^']*)'.*? could not be converted to (\w+)", text)
-    key = re.search(r"full_key: ([\w.]+)", text)
-    if unfit and key:
-        return f"{key.group(1)} wants {_TYPE_NAMES.get(unfit.group(2), unfit.group(2))}, got '{unfit.group(1)}'"
-    several = re.search(r"override (\S+?)=(\S*).*Cannot convert 'list' to string", text)
-    if several:
-        one = several.group(2).strip("[]':").split(",")[0]
-        return f"{several.group(1)} takes one value, got a list; write {several.group(1)}={one}"
-    single = re.search(r"override (\S+?)=(\S*).*is not a ListConfig", text)
-    if single:
-        return f"{single.group(1)} wants a list, got {single.group(2)}; write {single.group(1)}=[{single.group(2)}]"
-    lines = dict.fromkeys(" ".join(str(link).strip().splitlines()[0].split()) for link in chain if str(link).strip())
-    return ": ".join(list(lines)[:2])
-
-
-_TYPE_NAMES = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "a text"}
-
-
 def _set_up_logging() -> None:
     """Print the program's own messages plainly on standard output."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout)
@@ -392,7 +212,7 @@ def _set_up_logging() -> None:
 
 def _overview() -> str:
     """Return the help of `snarf` itself."""
-    rows = "\n".join(f"  {command.name:<12}{command.summary}" for command in _COMMANDS if not command.is_hidden)
+    rows = "\n".join(f"  {command.name:<12}{command.summary}" for command in COMMAND_LIST if not command.is_hidden)
     return (
         "snarf learns an animatable avatar of one subject from posed meshes.\n\n"
         f"usage: snarf COMMAND [FLAGS] [SETTING=VALUE ...]\n\n{rows}\n\n"

@@ -6,6 +6,7 @@ import pytest
 
 from snarfcli import cli
 from snarfcli.errors import UserError
+from snarfcli.messages import user_message
 from snarfcli.settings import describe, group_schemas, setting_names
 
 COMMANDS = ("preprocess", "train", "eval", "animate", "export", "doctor", "reproduce")
@@ -129,10 +130,10 @@ def test_flags_of_hydra_may_stand_anywhere(capsys):
 
 def test_unwritable_and_full_folders_are_named():
     full = OSError(28, "No space left on device", "outputs/x")
-    assert "outputs/x: the disk is full" in cli._user_message(full)
+    assert "outputs/x: the disk is full" in user_message(full)
     denied = PermissionError(13, "Permission denied", "/locked/x")
-    assert "/locked/x: no permission; choose another folder with output_root" in cli._user_message(denied)
-    assert cli._user_message(RuntimeError("a fault of the program")) is None
+    assert "/locked/x: no permission; choose another folder with output_root" in user_message(denied)
+    assert user_message(RuntimeError("a fault of the program")) is None
 
 
 def test_user_error_inside_another_error_is_found():
@@ -142,7 +143,7 @@ def test_user_error_inside_another_error_is_found():
         except UserError as inner:
             raise RuntimeError("outer") from inner
     except RuntimeError as error:
-        assert cli._user_message(error) == "the reason"
+        assert user_message(error) == "the reason"
 
 
 def test_interrupt_is_130(capsys, monkeypatch):

@@ -1,0 +1,79 @@
+"""Errors that a user can mend, in one line each."""
+
+from __future__ import annotations
+
+import errno
+import re
+
+from snarfcli.errors import UserError
+
+__all__ = ["user_message"]
+
+
+def user_message(error: BaseException) -> str | None:
+    """Return one line for an error that a user can mend, or None for a fault of the program."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    chain = _chain(error)
+    for link in chain:
+        if isinstance(link, UserError):
+            return _one_line(link)
+    for link in chain:
+        if isinstance(link, OSError) and not isinstance(link, (ConnectionError, ChildProcessError)):
+            return _file_message(link)
+    if isinstance(error, OmegaConfBaseException | HydraException):
+        return _config_message(chain)
+    return None
+
+
+def _chain(error: BaseException) -> list[BaseException]:
+    """Return the error and its causes."""
+    links: list[BaseException] = []
+    current: BaseException | None = error
+    while current is not None and current not in links:
+        links.append(current)
+        current = current.__cause__ or current.__context__
+    return links
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _file_message(error: OSError) -> str:
+    """Return what went wrong with a file and what to do."""
+    name = error.filename2 or error.filename or "a file"
+    advice = {
+        errno.ENOSPC: "the disk is full; make room, then run the command again: it goes on where it stopped",
+        errno.EDQUOT: "the disk quota is used up; make room, then run the command again",
+        errno.EACCES: "no permission; choose another folder with output_root=... or data_root=...",
+        errno.EPERM: "no permission; choose another folder with output_root=... or data_root=...",
+        errno.EROFS: "the file system is read-only; choose another folder with output_root=... or data_root=...",
+        errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
+        errno.EISDIR: "is a folder, not a file",
+        errno.EEXIST: "is a file, not a folder; choose another folder",
+        errno.ENOENT: "is not there and cannot be made; choose another folder or file",
+    }
+    return f"{name}: {advice.get(error.errno or 0, error.strerror or _one_line(error))}"
+
+
+def _config_message(chain: list[BaseException]) -> str:
+    """Return one line for a setting whose value does not fit."""
+    text = " ".join(_one_line(link) for link in chain)
+    unfit = re.search(r"Value '([^']*)'.*? could not be converted to (\w+)", text)
+    key = re.search(r"full_key: ([\w.]+)", text)
+    if unfit and key:
+        return f"{key.group(1)} wants {_TYPE_NAMES.get(unfit.group(2), unfit.group(2))}, got '{unfit.group(1)}'"
+    several = re.search(r"override (\S+?)=(\S*).*Cannot convert 'list' to string", text)
+    if several:
+        one = several.group(2).strip("[]':").split(",")[0]
+        return f"{several.group(1)} takes one value, got a list; write {several.group(1)}={one}"
+    single = re.search(r"override (\S+?)=(\S*).*is not a ListConfig", text)
+    if single:
+        return f"{single.group(1)} wants a list, got {single.group(2)}; write {single.group(1)}=[{single.group(2)}]"
+    lines = dict.fromkeys(" ".join(str(link).strip().splitlines()[0].split()) for link in chain if str(link).strip())
+    return ": ".join(list(lines)[:2])
+
+
+_TYPE_NAMES = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "a text"}

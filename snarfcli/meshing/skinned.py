@@ -17,10 +17,10 @@ from snarfcli.meshing.surfaces import AvatarLike, canonical_surface, check_posed
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-__all__ = ["SkinnedSurface", "skin_vertices"]
+__all__ = ["Followed", "SkinnedSurface", "skin_vertices"]
 
 # The motion of the shape with the pose is found at the vertices of a coarser mesh, 2 cm apart on a body, and interpolated:
-# against finding it at every vertex of a mesh of 256, 0.2 mm in the mean (benchmarks/bm_surfaces.py).
+# against finding it at every vertex of a mesh of 256, 0.2 to 0.4 mm off in the mean (benchmarks/bm_surfaces.py).
 _CONTROL_RESOLUTION = 96
 _STEPS = 8
 _FEWEST = 0.005  # share of the points that are not worth another step: they are in creases, and will hardly be believed
@@ -32,7 +32,8 @@ _LONGEST_STEP_M = 0.01
 _FARTHEST_M = 0.03  # that the pose may move a point of the canonical surface along its normal
 # How far a point may be from the mean of its neighbours before it is believed less. The shape moves smoothly, but in creases a
 # normal meets the surface of the other side, or none, and may do so in one frame and not in the next.
-# With these, of 230,000 motions of a point from one frame to the next, 8 instead of 230 are longer than 5 mm in punching.
+# So, of 1.7 million motions of a vertex from one frame to the next, none is longer than 5 mm instead of 430 in jumping jacks
+# (benchmarks/bm_surfaces.py).
 _OUTLIER_M = 0.003
 _FILLINGS = 20  # rounds in which points that found nothing take the mean of their neighbours
 _ROUNDS = 5  # of smoothing
@@ -72,9 +73,9 @@ class SkinnedSurface:
         if mesh is not None or resolution > _CONTROL_RESOLUTION:
             coarse = _settled(avatar, rest, canonical_surface(avatar, rest, _CONTROL_RESOLUTION, keep_share=keep_share))
         if coarse is None or len(coarse.vertices) >= len(fine.vertices):
-            self._control, self._corners, self._shares = _Followed(avatar, rest, fine), None, None
+            self.control, self._corners, self._shares = Followed(avatar, rest, fine), None, None
         else:
-            self._control = _Followed(avatar, rest, coarse)
+            self.control = Followed(avatar, rest, coarse)
             self._corners, self._shares = _nearest_points(fine.vertices, coarse)
 
     @torch.no_grad()
@@ -84,10 +85,11 @@ class SkinnedSurface:
         Raises:
             EmptySurface: in this pose the shape has no surface near most of the vertices.
         """
-        way = self._control.ways(pose.float())
-        if self._corners is not None:
-            way = np.einsum("vc,vc->v", way[self._corners], self._shares)
-        return self.mesh.vertices + way[:, None] * self.mesh.normals
+        return self.mesh.vertices + self.spread(self.control.ways(pose.float()))[:, None] * self.mesh.normals
+
+    def spread(self, way: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the ways of the vertices [V] between those of the control points [C], metres along the normals."""
+        return way if self._corners is None else np.einsum("vc,vc->v", way[self._corners], self._shares)
 
     @torch.no_grad()
     def posed(self, pose: Tensor, translation: Tensor | None = None, transforms: Tensor | None = None) -> Mesh:
@@ -106,7 +108,7 @@ class SkinnedSurface:
         return replace(self.mesh, vertices=vertices, normals=vertex_normals(vertices, self.mesh.faces))
 
 
-class _Followed:
+class Followed:
     """Points of the canonical surface that are followed along their normals as the pose changes the shape."""
 
     def __init__(self, avatar: AvatarLike, pose: Tensor, mesh: Mesh) -> None:
@@ -189,7 +191,7 @@ def _neighbours(mesh: Mesh) -> csr_matrix:
 def _settled(avatar: AvatarLike, pose: Tensor, mesh: Mesh) -> Mesh:
     """Return a canonical mesh with its vertices on the level set of the shape in `pose`, with weights and normals."""
     mesh = mesh.with_normals()
-    way, last_step = _Followed(avatar, pose, mesh).nearest_ways(pose)
+    way, last_step = Followed(avatar, pose, mesh).nearest_ways(pose)
     way = np.where(np.abs(last_step) > _LOST_M, 0, way)
     vertices = mesh.vertices + way[:, None] * mesh.normals
     weights = in_chunks(avatar.skinning_weights, vertices)

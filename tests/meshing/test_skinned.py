@@ -109,7 +109,7 @@ def test_a_point_that_finds_another_surface_than_its_neighbours_does_not_jump():
 
     surface = SkinnedSurface(Spiked(), 48)
     pose = twisted(1.0)
-    way, _ = surface._control.nearest_ways(pose)
+    way, _ = surface.control.nearest_ways(pose)
     assert way.max() > 0.025  # found, and not believed
     ways = radii(surface.canonical_vertices(pose)) - RADIUS
     np.testing.assert_allclose(ways, 0.01, atol=1.5e-3)

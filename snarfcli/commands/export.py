@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -176,8 +175,8 @@ def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:
         clip = Clip(chosen.motion, chosen.bone_transforms)
         is_builtin = pose is None and clip.bone_transforms is None and clip.motion.name in BUILTIN_MOTIONS
         if config.height == "ground" or (config.height == "auto" and is_builtin):
-            mesh = avatar.skinned_surface(min(_GROUND_RESOLUTION, config.resolution)).mesh
-            clip, up = on_ground(mesh, avatar.skeleton, clip)
+            rough = CharacterOptions(triangles=None, resolution=min(_GROUND_RESOLUTION, config.resolution))
+            clip, up = on_ground(character_surface(avatar, rough).mesh, avatar.skeleton, clip)
             log.info("%s stands on y = 0: moved by %.3f m", clip.motion.name, up)
         clips.append(clip)
     return clips
@@ -192,9 +191,10 @@ def _write_character(
 ) -> _Written:
     """Write the file; in a format of Blender's from a temporary .glb."""
     subject = _subject(config, avatar)
-    export: Callable[[Path], ExportReport] = lambda path: export_character(  # noqa: E731
-        avatar, path, clips, options, name=subject, overwrite=config.overwrite
-    )
+
+    def export(path: Path) -> ExportReport:
+        return export_character(avatar, path, clips, options, name=subject, overwrite=config.overwrite)
+
     if not blender:
         report = export(output)
         size = report.num_bytes

@@ -292,10 +292,11 @@ def test_what_a_user_can_get_wrong(folder, capsys, arguments, message):
 
 
 @pytest.mark.parametrize("logit", [-1.0, 1.0])
+@pytest.mark.parametrize("height", ["file", "ground"])  # the ground is looked for on the surface too
 @pytest.mark.parametrize("suffix", ["glb", "ply"])
-def test_an_avatar_without_surface_is_a_line(folder, capsys, monkeypatch, logit, suffix):
+def test_an_avatar_without_surface_is_a_line(folder, capsys, monkeypatch, logit, suffix, height):
     monkeypatch.setattr(ToyCharacter, "canonical_logits", lambda self, points, pose: torch.full((len(points),), logit))
-    code, err = export(capsys, "--pose", pose_file("walk.npz"), f"format={suffix}")
+    code, err = export(capsys, "--pose", pose_file("walk.npz"), f"format={suffix}", f"height={height}")
     assert code == 2 and len(err.splitlines()) == 1
     assert "this avatar has no surface to export: the field is" in err and "train it longer" in err
     assert not (folder / "export").exists()

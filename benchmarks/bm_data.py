@@ -20,12 +20,11 @@ from common import arguments, median_and_spread, print_machine, print_table, req
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from snarfcli.cli import register_schemas
 from snarfcli.commands.train import TrainConfig, new_trainer
 from snarfcli.datasets.builtin import builtin_subject
-from snarfcli.datasets.preprocessing import preprocess_subject
-from snarfcli.datasets.store import SampleStore
-from snarfcli.datasets.writing import SequenceWriter
+from snarfcli.samples.preprocessing import preprocess_subject
+from snarfcli.samples.store import SampleStore
+from snarfcli.samples.writing import SequenceWriter
 from snarfcli.sampling import (
     SamplingSettings,
     check_mesh,
@@ -38,7 +37,7 @@ from snarfcli.sampling import (
     surface_samples,
     winding_numbers,
 )
-from snarfcli.settings import config_folder
+from snarfcli.settings import config_folder, register_schemas
 from snarfcli.training.batches import FrameBatches, FreshBatches
 
 SAMPLING = SamplingSettings(points_per_frame=20_000, surface_noise_m=0.01, padding=0.1, inside_test="winding", seed=0)

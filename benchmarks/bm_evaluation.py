@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from common import arguments, median_and_spread, print_machine, print_table, require, timed
 
-from snarfcli.datasets.store import SampleStore
+from snarfcli.avatar import Avatar
 from snarfcli.deformer import SearchConfig
-from snarfcli.models.avatar import Avatar
+from snarfcli.samples.store import SampleStore
 
 SEARCHES = {
     "complete, cells near the body": SearchConfig("complete"),

@@ -19,9 +19,9 @@ from unittest import mock
 import torch
 from common import arguments, median_and_spread, print_machine, print_table, require, timed
 
+from snarfcli.avatar import Avatar
 from snarfcli.meshing.extract import extract_surface
 from snarfcli.models import system
-from snarfcli.models.avatar import Avatar
 from snarfcli.motions import builtin_motion
 
 

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from toy_animal import ANIMAL_CLIPS, HELD_OUT_CLIP, animal_motion, make_animal
 from toy_animal_files import animal_glb
 
-from snarfcli.cli import main as snarf
+from snarfcli.cli.main import main as snarf
 from snarfcli.datasets.builtin import builtin_subject
 
 _PERSON = "50009"

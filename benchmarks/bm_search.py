@@ -27,7 +27,7 @@ from searches import Method, as_found, methods
 from torch import Tensor
 
 from snarfcli.deformer import blend_transforms
-from snarfcli.deformer.library import instruction_set, why_unavailable
+from snarfcli.native.library import instruction_set, why_unavailable
 from snarfcli.runs import machine_facts
 from snarfcli.sampling import winding_numbers
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import torch
 from common import arguments, print_machine, print_table, timed
 
-from snarfcli.models.inference import evaluate
 from snarfcli.precision import network_precision
 from snarfcli.shape import OccupancyNetwork, ShapeConfig
+from snarfcli.shape.inference import evaluate
 
 _JOINTS = 23
 _SIZES = {

@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from common import arguments, print_machine, print_table, require
 
+from snarfcli.avatar import Avatar
 from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.datasets.subjects import SequenceSpec
 from snarfcli.evaluation.surface_metrics import compare_surfaces, sample_surface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.skinned import Followed, SkinnedSurface
 from snarfcli.meshing.surfaces import field_surface
-from snarfcli.models.avatar import Avatar
 from snarfcli.motions import builtin_motion
 from snarfcli.progress import progress
 

@@ -12,11 +12,10 @@ from common import arguments, median_and_spread, print_machine, print_table, req
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from snarfcli.cli import register_schemas
 from snarfcli.commands.train import TrainConfig, new_trainer
-from snarfcli.datasets.store import SampleStore
 from snarfcli.precision import matmul_precision
-from snarfcli.settings import config_folder
+from snarfcli.samples.store import SampleStore
+from snarfcli.settings import config_folder, register_schemas
 from snarfcli.training.losses import occupancy_loss
 
 

@@ -13,16 +13,16 @@ import numpy as np
 import torch
 from common import arguments, median_and_spread, print_machine, print_table, require, timed
 
-from snarfcli.export import Camera, render, write_video
-from snarfcli.export.animation import Animation
-from snarfcli.export.floor import Backdrop, Ground
-from snarfcli.export.lighting import Look, Solid
-from snarfcli.export.panels import Screen
-from snarfcli.export.stage import body_points, set_stage
-from snarfcli.export.views import parse_views
-from snarfcli.models.avatar import Avatar
+from snarfcli.avatar import Avatar
 from snarfcli.motions import builtin_motion
 from snarfcli.parallel import count_cores
+from snarfcli.rendering import Camera, render, write_video
+from snarfcli.rendering.animation import Animation
+from snarfcli.rendering.floor import Backdrop, Ground
+from snarfcli.rendering.lighting import Look, Solid
+from snarfcli.rendering.panels import Screen
+from snarfcli.rendering.stage import body_points, set_stage
+from snarfcli.rendering.views import parse_views
 
 
 def main() -> None:

@@ -4,7 +4,7 @@
     python benchmarks/gpu_check.py --write-scenes scenes.pt  where all packages are: the body's scenes for another machine,
     python benchmarks/gpu_check.py --scenes scenes.pt        which then needs no more than PyTorch and NumPy
 
-In order: compile all kernels (cold and from the cache); run tests/deformer/test_cuda.py, once plainly and, where there is a
+In order: compile all kernels (cold and from the cache); run tests/native/test_cuda.py, once plainly and, where there is a
 compute-sanitizer, under its checkers; compare with the CPU library on 200,000 queries a scene; time the searches and the
 gradient, alone (in a CUDA graph, by events) and as called from Python, beside the broyden kernel and a Fast-SNARF search in
 PyTorch; time every kernel and compare the bytes it must move with the bandwidth that a plain copy reaches; measure the memory.
@@ -29,12 +29,13 @@ import torch
 from rivals import released_search
 from torch import Tensor
 
-from snarfcli.deformer import CanonicalGrid, cuda, cuda_compile, cuda_driver, find_correspondences
+from snarfcli.deformer import CanonicalGrid, find_correspondences
 from snarfcli.deformer.correspondences import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
+from snarfcli.native import cuda, cuda_compile, cuda_driver
 
 ROOT = Path(__file__).resolve().parents[1]
-TEST = "tests/deformer/test_cuda.py"
+TEST = "tests/native/test_cuda.py"
 SCENES = ("knees", "arms_behind_back", "random joints")
 TOLERANCE, STEPS = 5e-6, 10  # find_correspondences' own
 BROYDEN_M = (1e-4, 0.5)  # the released thresholds, metres

@@ -106,12 +106,11 @@ class _Step:
         from hydra import compose, initialize_config_dir
         from omegaconf import OmegaConf
 
-        from snarfcli.cli import register_schemas
         from snarfcli.commands.train import TrainConfig
         from snarfcli.datasets.builtin import builtin_subject
         from snarfcli.models.fast_snarf import FastSnarf
         from snarfcli.models.settings import AvatarConfig
-        from snarfcli.settings import config_folder
+        from snarfcli.settings import config_folder, register_schemas
 
         register_schemas("train", TrainConfig)
         overrides = ["training=paper", "subject=50002", f"skinning.resolution={list(resolution)}"]

@@ -11,7 +11,7 @@ from scenes import Scene
 from torch import Tensor
 
 from snarfcli.deformer import find_correspondences
-from snarfcli.deformer.library import native_library
+from snarfcli.native.library import native_library
 
 __all__ = ["Found", "Method", "as_found", "methods"]
 

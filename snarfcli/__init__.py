@@ -8,7 +8,7 @@ __version__ = "0.1.0"
 __all__ = ["Avatar", "__version__", "find_correspondences", "load_body"]
 
 _HOMES = {
-    "Avatar": "snarfcli.models.avatar",
+    "Avatar": "snarfcli.avatar",
     "find_correspondences": "snarfcli.deformer",
     "load_body": "snarfcli.bodies",
 }

@@ -1,6 +1,6 @@
 """`python -m snarfcli` is the `snarf` command."""
 
-from snarfcli.cli import main
+from snarfcli.cli.main import main
 
 if __name__ == "__main__":
     raise SystemExit(main())

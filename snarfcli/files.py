@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
@@ -18,7 +19,7 @@ import numpy as np
 
 from snarfcli.errors import UserError
 
-__all__ = ["MAX_ARRAY_BYTES", "atomic_path", "read_json", "read_npy", "read_npz", "write_json", "write_tensors"]
+__all__ = ["MAX_ARRAY_BYTES", "atomic_path", "file_digest", "read_json", "read_npy", "read_npz", "write_json", "write_tensors"]
 
 MAX_ARRAY_BYTES = 2**30
 """What the arrays of one file may take, unless a reader says otherwise."""
@@ -29,6 +30,15 @@ _LONGEST_HEADER = 2**16
 _MOST_JSON_BYTES = 2**25  # parsed they take some 600 MiB
 # The header is a Python dict of three entries; a type that is no word stands for records.
 _HEADER = (r"'descr':\s*'([^']*)'", r"'fortran_order':\s*(True|False)", r"'shape':\s*\(([\d\sL,]*)\)")
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 @contextmanager

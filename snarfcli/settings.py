@@ -25,6 +25,7 @@ __all__ = [
     "preset_groups",
     "quote",
     "quote_items",
+    "register_schemas",
     "setting_names",
 ]
 
@@ -52,6 +53,16 @@ def group_schemas(schema: type) -> dict[str, type]:
     hints = typing.get_type_hints(schema)
     kinds = {field.name: typing.get_args(hints[field.name]) or (hints[field.name],) for field in dataclasses.fields(schema)}
     return {name: kind for name, options in kinds.items() for kind in options if dataclasses.is_dataclass(kind)}
+
+
+def register_schemas(name: str, schema: type) -> None:
+    """Put the dataclass of a command, and those of its fields, into Hydra's store as `schema/...`."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance()
+    store.store(group="schema", name=name, node=schema)
+    for group, node in group_schemas(schema).items():
+        store.store(group="schema", name=group, node=node)
 
 
 def describe(schema: type) -> Iterator[tuple[str, str]]:

@@ -7,7 +7,7 @@ import importlib
 import pytest
 import yaml
 
-from snarfcli import cli
+from snarfcli.cli import main as cli
 from snarfcli.settings import config_folder, group_options, preset_groups
 
 NAMES = ("preprocess", "train", "eval", "animate", "export")

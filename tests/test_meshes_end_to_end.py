@@ -8,7 +8,7 @@ import pytest
 from toy_animal import animal_motion, make_animal
 from toy_animal_files import animal_glb
 
-from snarfcli.cli import main
+from snarfcli.cli.main import main
 
 
 @pytest.fixture

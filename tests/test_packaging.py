@@ -71,9 +71,9 @@ def test_the_wheel_holds_what_is_needed_at_run_time(wheel, tmp_path):
 
 
 def _native_name() -> str:
-    from snarfcli.deformer import library
+    from snarfcli.native import library
 
-    return f"snarfcli/deformer/{library._FILE_NAME}"
+    return f"snarfcli/native/{library._FILE_NAME}"
 
 
 def test_the_wheel_runs_from_anywhere(wheel, tmp_path):
@@ -81,9 +81,9 @@ def test_the_wheel_runs_from_anywhere(wheel, tmp_path):
     done = run_from(
         tmp_path,
         "from snarfcli.bodies import builtin_body; assert len(builtin_body().v_template) == 6890; "
-        "from snarfcli.deformer.library import choose_backend, library_path; "
+        "from snarfcli.native.library import choose_backend, library_path; "
         f"assert choose_backend('native') == 'native' and {str(tmp_path)!r} in str(library_path()); "
-        "from snarfcli.cli import main; raise SystemExit(main(['train', '--cfg', 'job']))",
+        "from snarfcli.cli.main import main; raise SystemExit(main(['train', '--cfg', 'job']))",
     )
     assert done.returncode == 0, done.stderr
     assert "subject: '50002'" in done.stdout
@@ -96,7 +96,7 @@ def test_without_a_compiler_the_wheel_runs_on_the_reference_with_one_warning(tmp
     assert not [name for name in names if "libsnarf_native" in name]
     done = run_from(
         tmp_path / "site",
-        "import torch; from snarfcli.deformer import CanonicalGrid, find_correspondences, library; "
+        "import torch; from snarfcli.deformer import CanonicalGrid, find_correspondences; from snarfcli.native import library; "
         "grid = CanonicalGrid(torch.tensor([-1.0] * 3), torch.tensor([1.0] * 3)); points = torch.full((1, 5, 3), 0.3); "
         "found = [find_correspondences(points, torch.eye(4)[None, None], torch.ones(3, 3, 3, 1), grid) for _ in range(2)]; "
         "assert found[1].query.tolist() == [0, 1, 2, 3, 4] and library.choose_backend('auto') == 'reference'",
@@ -118,7 +118,7 @@ def test_a_source_that_does_not_compile_leaves_the_library_out(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     (wheel,) = tmp_path.glob("snarf-*.whl")
     unpack(wheel, tmp_path / "site")
-    done = run_from(tmp_path / "site", "from snarfcli.deformer.library import choose_backend; choose_backend('auto')")
+    done = run_from(tmp_path / "site", "from snarfcli.native.library import choose_backend; choose_backend('auto')")
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("Warning") == 1 and "reinstall snarf with a C++ compiler" in done.stderr
 

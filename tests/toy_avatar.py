@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import torch
+from analytic_avatar import AnalyticAvatar, capsule
 from torch import Tensor
 
 from snarfcli.bodies import Skeleton
-from snarfcli.meshing.skinned import SkinnedSurface
+from snarfcli.deformer import CanonicalGrid
+from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples
 
 RADIUS = 0.1
 LENGTH = 0.5
 
 
-def capsule(points: Tensor, start: tuple, end: tuple, radius: float) -> Tensor:
-    """Distance into a capsule, positive inside, metres."""
-    start_t, end_t = points.new_tensor(start), points.new_tensor(end)
-    along = end_t - start_t
-    share = ((points - start_t) @ along / (along @ along)).clamp(0, 1)
-    return radius - (points - start_t - share[:, None] * along).norm(dim=1)
-
-
-class ToyAvatar:
+class ToyAvatar(AnalyticAvatar):
     """Two bones along x that meet at the origin of bone 1; further joints, if any, sit at the tip and move nothing.
 
     The posed field is that of the nearest preimage by fixed-point iteration, which has one root for moderate bends.
     """
-
-    has_skinning_weights = True
-    device = torch.device("cpu")
 
     def __init__(self, num_joints: int = 2, radius: float = RADIUS) -> None:
         rest = torch.zeros(num_joints, 3)
@@ -37,12 +26,10 @@ class ToyAvatar:
         rest[2:, 0] = 2 * LENGTH
         names = tuple(f"joint_{j}" for j in range(num_joints))
         parents = tuple([-1, 0] + [1] * (num_joints - 2))
-        self.skeleton = Skeleton(names, parents, rest, torch.zeros(num_joints, 3))
+        skeleton = Skeleton(names, parents, rest, torch.zeros(num_joints, 3))
+        super().__init__(skeleton, CanonicalGrid(torch.full((3,), -0.2), torch.tensor([2 * LENGTH + 0.2, 0.2, 0.2])))
         self.radius = radius
         self.queried = 0
-
-    def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
-        return self.skeleton.posed_from_canonical(pose, translation)
 
     def canonical_logits(self, points_c: Tensor, pose: Tensor) -> Tensor:
         return 40 * capsule(points_c, (0.0, 0, 0), (2 * LENGTH, 0, 0), self.radius)
@@ -53,11 +40,7 @@ class ToyAvatar:
         weights[:, 0] = 1 - weights[:, 1]
         return weights
 
-    def skin(self, points_c: Tensor, bone_transforms: Tensor) -> Tensor:
-        blended = torch.einsum("nj,jrc->nrc", self.skinning_weights(points_c), bone_transforms[:, :3])
-        return (blended[:, :, :3] @ points_c[:, :, None])[:, :, 0] + blended[:, :, 3]
-
-    def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> SimpleNamespace:
+    def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> FieldSamples:
         points, transforms = points[0], bone_transforms[0]
         self.queried += len(points)
         best = None
@@ -68,17 +51,13 @@ class ToyAvatar:
                 blended = torch.einsum("nj,jrc->nrc", self.skinning_weights(points_c), transforms[:, :3])
                 points_c = torch.linalg.solve(blended[:, :, :3], (points - blended[:, :, 3])[:, :, None])[:, :, 0]
             error = (self.skin(points_c, transforms) - points).norm(dim=1)
-            logits = torch.where(error < 1e-4, self.canonical_logits(points_c, pose[0]), -1e9)
+            logits = torch.where(error < 1e-4, self.canonical_logits(points_c, pose[0]), NO_CORRESPONDENCE)
             best = logits if best is None else torch.maximum(best, logits)
-        return SimpleNamespace(logits=best[None], found=best[None] > -1e8, timings={})
-
-    def canonical_box(self) -> tuple[Tensor, Tensor]:
-        return torch.tensor([-0.2, -0.2, -0.2]), torch.tensor([2 * LENGTH + 0.2, 0.2, 0.2])
+        assert best is not None
+        found = best[None] > NO_CORRESPONDENCE
+        return FieldSamples(best[None], found, found.long(), 0.0, 0.0)
 
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
         tips = torch.tensor([[0.0, 0, 0], [LENGTH, 0, 0], [2 * LENGTH, 0, 0]])
         moved = self.skin(tips, bone_transforms)
         return moved.amin(0) - 0.2, moved.amax(0) + 0.2
-
-    def skinned_surface(self, resolution: int = 256, keep_share: float = 0.01) -> SkinnedSurface:
-        return SkinnedSurface(self, resolution, keep_share=keep_share)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import torch
+from analytic_avatar import AnalyticAvatar, capsule
 from torch import Tensor
-from toy_avatar import capsule
 
 from snarfcli.bodies import Skeleton
+from snarfcli.deformer import CanonicalGrid
 from snarfcli.export.rig import Clip
-from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.motions import Motion
 
 JOINTS = 6
@@ -21,11 +19,8 @@ BULGE = 0.015
 FRAME_RATE = 24.0
 
 
-class ToyCharacter:
+class ToyCharacter(AnalyticAvatar):
     """Six bones in a row along x, 20 cm each, bent in the canonical pose too; it swells where it bends."""
-
-    has_skinning_weights = True
-    device = torch.device("cpu")
 
     def __init__(self, *, bulge: float = BULGE, spread: float = 0.12) -> None:
         rest = torch.zeros(JOINTS, 3)
@@ -33,13 +28,11 @@ class ToyCharacter:
         canonical = torch.zeros(JOINTS, 3)
         canonical[0] = torch.tensor([0.0, 0.0, 0.3])
         canonical[2, 1] = 0.2
-        self.skeleton = Skeleton(tuple(f"bone_{j}" for j in range(JOINTS)), tuple(range(-1, JOINTS - 1)), rest, canonical)
-        self.facts = {"subject": "worm"}
-        self.config = SimpleNamespace(model=SimpleNamespace(name="toy"), condition=SimpleNamespace(name="global"))
+        skeleton = Skeleton(tuple(f"bone_{j}" for j in range(JOINTS)), tuple(range(-1, JOINTS - 1)), rest, canonical)
+        joints = skeleton.canonical_joints
+        grid = CanonicalGrid(joints.amin(0) - 0.15, joints.amax(0) + BONE + 0.15)
+        super().__init__(skeleton, grid, subject="worm")
         self.bulge, self.spread = bulge, spread
-
-    def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
-        return self.skeleton.posed_from_canonical(pose, translation)
 
     def canonical_logits(self, points_c: Tensor, pose: Tensor) -> Tensor:
         joints = self.skeleton.canonical_joints
@@ -56,17 +49,6 @@ class ToyCharacter:
         middles = (joints + torch.cat([joints[1:], joints[-1:] + joints[-1:] - joints[-2:-1]])) / 2
         distance = (points_c[:, None] - middles).norm(dim=2)
         return torch.softmax(-(distance**2) / (2 * self.spread**2), dim=1)
-
-    def skin(self, points_c: Tensor, bone_transforms: Tensor) -> Tensor:
-        blended = torch.einsum("nj,jrc->nrc", self.skinning_weights(points_c), bone_transforms[:, :3])
-        return (blended[:, :, :3] @ points_c[:, :, None])[:, :, 0] + blended[:, :, 3]
-
-    def canonical_box(self) -> tuple[Tensor, Tensor]:
-        joints = self.skeleton.canonical_joints
-        return joints.amin(0) - 0.15, joints.amax(0) + BONE + 0.15
-
-    def skinned_surface(self, resolution: int = 256, keep_share: float = 0.01) -> SkinnedSurface:
-        return SkinnedSurface(self, resolution, keep_share=keep_share)
 
 
 def wave(frames: int = 13, name: str = "wave", turn: float = 0.7, rate: float = FRAME_RATE) -> Motion:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from toy_subject import toy_subject
 
-from snarfcli.datasets.preprocessing import preprocess_subject
-from snarfcli.datasets.store import SampleStore
+from snarfcli.avatar import Avatar
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
-from snarfcli.models.avatar import Avatar
 from snarfcli.models.settings import AvatarConfig, ModelConfig
+from snarfcli.samples.preprocessing import preprocess_subject
+from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import SamplingSettings
 from snarfcli.shape import ConditionConfig, ShapeConfig
 from snarfcli.training.extent import rough_canonical_points

@@ -8,7 +8,7 @@ from toy_avatar import ToyAvatar
 
 from snarfcli.viewer.body import Body
 from snarfcli.viewer.picture import Look, Picture
-from snarfcli.viewer.viewing import Viewing
+from snarfcli.viewer.state import Viewing
 
 PATIENCE = 60  # seconds; nothing waits that long unless something is wrong
 SMALL = Look(skinned_resolution=24, field_resolution=24)

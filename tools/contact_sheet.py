@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import argparse
 
-from snarfcli.datasets.store import SampleStore
+from snarfcli.avatar import Avatar
 from snarfcli.evaluation.figure import draw_frame
-from snarfcli.export.sheet import contact_sheet, write_png
-from snarfcli.models.avatar import Avatar
+from snarfcli.rendering.sheet import contact_sheet, write_png
+from snarfcli.samples.store import SampleStore
 
 _FRAMES = {
     "id": [("chicken_wings", 0.2), ("chicken_wings", 0.6)],

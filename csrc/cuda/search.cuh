@@ -1,6 +1,6 @@
 // What the kernels of a search share: their arguments, and how a root is reported.
 //
-// Every kernel of a search takes the same structure by value; snarfcli/deformer/cuda.py fills it in. SNARF_NUMBER is float or
+// Every kernel of a search takes the same structure by value; snarfcli/native/cuda.py fills it in. SNARF_NUMBER is float or
 // double: NVRTC compiles each source once for either.
 #pragma once
 

@@ -12,32 +12,33 @@ from typing import Any
 
 import numpy as np
 
+from snarfcli.avatar import Avatar
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.animate_settings import AnimateConfig
 from snarfcli.commands.animation_folder import POSTER, RECORD, VIDEO, folder_name, frame_settings, prepare_folder
-from snarfcli.commands.choices import (
+from snarfcli.commands.ground_truth import true_meshes
+from snarfcli.commands.selection import (
     ChosenMotion,
     check_motion_choice,
     choose_motion,
     load_chosen_avatar,
 )
-from snarfcli.commands.truth import true_meshes
 from snarfcli.errors import UserError
-from snarfcli.export.animation import CONTENTS, Animation, Meshes, place_canonical
-from snarfcli.export.meshes import MESH_WRITERS
-from snarfcli.export.panels import Screen, picture_size
-from snarfcli.export.processes import choose_processes, parse_processes
-from snarfcli.export.sheet import write_png
-from snarfcli.export.stage import CAMERAS, body_points, set_stage
-from snarfcli.export.video import write_video
-from snarfcli.export.views import View, parse_turntable, parse_views
 from snarfcli.files import write_json
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
-from snarfcli.meshing.surfaces import SURFACES, canonical_surface
-from snarfcli.models.avatar import Avatar
+from snarfcli.meshing.mesh_files import MESH_WRITERS
+from snarfcli.meshing.posed import SURFACES
+from snarfcli.meshing.surfaces import canonical_surface
 from snarfcli.motions import Motion
 from snarfcli.parallel import count_cores
+from snarfcli.rendering.animation import CONTENTS, Animation, Meshes, place_canonical
+from snarfcli.rendering.panels import Screen, picture_size
+from snarfcli.rendering.processes import choose_processes, parse_processes
+from snarfcli.rendering.sheet import write_png
+from snarfcli.rendering.stage import CAMERAS, body_points, set_stage
+from snarfcli.rendering.video import write_video
+from snarfcli.rendering.views import View, parse_turntable, parse_views
 from snarfcli.runs import machine_facts
 
 __all__ = ["AnimateConfig", "run"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from omegaconf import MISSING
 
-from snarfcli.commands.choices import AvatarChoice, MotionChoice
+from snarfcli.commands.selection import AvatarChoice, MotionChoice
 
 __all__ = ["AnimateConfig"]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from snarfcli import names
 from snarfcli.commands.animate_settings import AnimateConfig
-from snarfcli.commands.choices import ChosenMotion
+from snarfcli.commands.selection import ChosenMotion
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 

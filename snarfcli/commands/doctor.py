@@ -85,7 +85,7 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
     from snarfcli.datasets.checking import LookedAt, Remark, check_subject
     from snarfcli.datasets.sources import Request, find_source
     from snarfcli.datasets.subjects import SubjectData
-    from snarfcli.export.bones import write_bones_figure
+    from snarfcli.rendering.bones import write_bones_figure
 
     request = Request(data, Path(config.data_root), config.body)
     subjects = [config.subject] if config.subject not in (None, "all") else list(find_source(data.name).subjects(request))
@@ -169,7 +169,7 @@ def _processor() -> Iterator[Finding]:
 
 def _native() -> Finding:
     """Return whether the native library runs, or why not."""
-    from snarfcli.deformer.library import build_note, instruction_set, library_path, why_unavailable
+    from snarfcli.native.library import build_note, instruction_set, library_path, why_unavailable
 
     reason = why_unavailable()
     if reason is not None:
@@ -189,7 +189,7 @@ def _gpu() -> Iterator[Finding]:
         device = torch.cuda.get_device_properties(index)
         memory = f"{device.total_memory / 2**30:.1f} GiB"
         yield Finding(f"cuda:{index}", f"{device.name}, {memory}, compute capability {device.major}.{device.minor}")
-    from snarfcli.deformer.cuda import cuda_status
+    from snarfcli.native.cuda import cuda_status
 
     status = cuda_status()
     yield Finding("CUDA kernels", status, is_fallback=count > 0 and status.startswith("not available"))

@@ -10,10 +10,11 @@ from pathlib import Path
 
 from omegaconf import MISSING
 
-from snarfcli.checks import check_choice, check_number, check_search
+from snarfcli.avatar import Avatar
+from snarfcli.checks import check_choice, check_number
+from snarfcli.commands.deformer_checks import check_search
 from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.store import SampleStore, samples_folder
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import evaluate
@@ -21,9 +22,9 @@ from snarfcli.evaluation.report import SPLITS, Evaluation, metrics_content, tabl
 from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
 from snarfcli.files import write_json
-from snarfcli.models.avatar import Avatar
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
+from snarfcli.samples.store import SampleStore, samples_folder
 
 __all__ = ["EvalConfig", "run"]
 

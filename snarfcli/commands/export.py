@@ -11,8 +11,9 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from snarfcli.avatar import Avatar
 from snarfcli.checks import check_choice
-from snarfcli.commands.choices import (
+from snarfcli.commands.selection import (
     BUILTIN_MOTIONS,
     AvatarChoice,
     MotionChoice,
@@ -23,13 +24,11 @@ from snarfcli.commands.choices import (
 from snarfcli.errors import UserError
 from snarfcli.export.blender import BLENDER_FORMATS, convert, find_blender
 from snarfcli.export.character import CharacterOptions, character_surface, check_avatar, check_options
-from snarfcli.export.exporting import ExportReport, check_output, export_character
-from snarfcli.export.ground import HEIGHTS, on_ground
-from snarfcli.export.meshes import MESH_WRITERS
-from snarfcli.export.rig import Clip
+from snarfcli.export.export import ExportReport, check_output, export_character
+from snarfcli.export.rig import HEIGHTS, Clip, on_ground
 from snarfcli.export.sequence import atomic_folder, check_folder, write_sequence
 from snarfcli.files import write_json
-from snarfcli.models.avatar import Avatar
+from snarfcli.meshing.mesh_files import MESH_WRITERS
 from snarfcli.names import folder_name
 from snarfcli.runs import machine_facts, run_folder
 

@@ -57,9 +57,9 @@ def run(config: PreprocessConfig) -> None:
         UserError: a value cannot be used, a subject or sequence is unknown, or the samples there do not go with the settings.
         OSError: the data folder cannot be written to, or the disk is full.
     """
-    from snarfcli.datasets.preprocessing import preprocess_subject
     from snarfcli.datasets.sources import Request, find_source
     from snarfcli.parallel import count_cores
+    from snarfcli.samples.preprocessing import preprocess_subject
     from snarfcli.sampling import SamplingSettings
 
     source = find_source(config.data.name)

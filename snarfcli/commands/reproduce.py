@@ -22,7 +22,7 @@ from snarfcli.reproduce.report import write_report
 from snarfcli.reproduce.results import Result, collect
 from snarfcli.reproduce.tables import plain_table
 from snarfcli.runs import choose_device
-from snarfcli.settings import check_overrides, config_folder, preset_groups
+from snarfcli.settings import check_overrides, config_folder, preset_groups, register_schemas
 
 __all__ = ["ReproduceConfig", "resolve_training", "run"]
 
@@ -135,7 +135,6 @@ def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 
-    from snarfcli.cli import register_schemas
 
     check_overrides(overrides, TrainConfig, "train")
     presets = preset_groups(TrainConfig, "train")

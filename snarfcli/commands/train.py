@@ -12,22 +12,24 @@ from typing import Any
 import torch
 from omegaconf import MISSING, OmegaConf
 
-from snarfcli.checks import check_choice, check_number, check_search, check_skinning
+from snarfcli.avatar import Avatar
+from snarfcli.checks import check_choice, check_number
+from snarfcli.commands.deformer_checks import check_search, check_skinning
 from snarfcli.datasets.builtin import check_subject
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.store import SampleStore, samples_folder
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
-from snarfcli.models.avatar import SYSTEMS, Avatar
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.models.system import MeshTemplate
+from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
+from snarfcli.samples.store import SampleStore, samples_folder
 from snarfcli.shape import CONDITIONS, ConditionConfig, ShapeConfig
 from snarfcli.training.extent import rough_canonical_points
 from snarfcli.training.loop import train

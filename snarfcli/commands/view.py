@@ -12,14 +12,14 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from snarfcli.avatar import Avatar
 from snarfcli.checks import check_choice, check_number
-from snarfcli.commands.choices import AvatarChoice, MotionChoice, check_motion_choice, choose_motion, load_chosen_avatar
-from snarfcli.datasets.store import SampleStore
+from snarfcli.commands.selection import AvatarChoice, MotionChoice, check_motion_choice, choose_motion, load_chosen_avatar
 from snarfcli.errors import UserError
 from snarfcli.export.rig import unique_names
-from snarfcli.models.avatar import Avatar
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL, layout_of
+from snarfcli.samples.store import SampleStore
 from snarfcli.viewer.picture import SURFACE_NAMES, Look
 from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback, require_viser
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from snarfcli.bodies.skeleton import Skeleton, legs_apart_pose
 from snarfcli.checks import check_choice
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
-from snarfcli.datasets.recordings import Recording, World, person_scale
+from snarfcli.datasets.recorded_sequence import Recording, World, person_scale
 from snarfcli.datasets.rigged import RIG_SUFFIXES, bvh_poses, bvh_skeleton, read_rigged_files
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.skeleton_files import SkeletonFile, read_poses, read_skeleton

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.datasets.store import file_digest
+from snarfcli.files import file_digest
 
 if TYPE_CHECKING:
     from snarfcli.bodies import Body

@@ -9,7 +9,7 @@ from snarfcli.deformer.deformer import ForwardDeformer, SkinningConfig
 from snarfcli.deformer.diffusion import PresetWeights
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid
-from snarfcli.deformer.search import SearchConfig
+from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, skin
 from snarfcli.deformer.weights import BonePrior, WeightField
 

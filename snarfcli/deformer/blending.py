@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from snarfcli.deformer import native
-from snarfcli.deformer.library import choose_backend
+from snarfcli.native import cpu
+from snarfcli.native.library import choose_backend
 from snarfcli.precision import matmul_precision
 
 __all__ = ["blend", "blend_backward", "refuse_second_derivative"]
@@ -27,7 +27,7 @@ def blend(weights: Tensor, bones: Tensor, active_cells: Tensor | None, backend: 
     Source: Fast-SNARF Eq. 13.
     """
     if not weights.is_cuda and choose_backend(backend) == "native":
-        return native.blend(weights, bones, active_cells)
+        return cpu.blend(weights, bones, active_cells)
     with matmul_precision("highest"), torch.autocast(weights.device.type, enabled=False):
         return torch.matmul(weights.reshape(1, -1, weights.shape[-1]), bones)
 
@@ -47,7 +47,7 @@ def blend_backward(
     The gradient by the result is taken to be zero at nodes that are no corner of an active cell.
     """
     if not weights.is_cuda and choose_backend(backend) == "native":
-        return native.blend_backward(gradient, weights, bones, active_cells, (wants_weights, wants_bones))
+        return cpu.blend_backward(gradient, weights, bones, active_cells, (wants_weights, wants_bones))
     flat = weights.reshape(-1, weights.shape[-1])
     v_weights, v_bones = weights.new_empty(0), bones.new_empty(0)
     with matmul_precision("highest"), torch.autocast(weights.device.type, enabled=False):

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.deformer.grid import CORNERS, CanonicalGrid, cell_corners
-from snarfcli.deformer.search import Roots, drop_duplicates, invert_3x3
+from snarfcli.deformer.roots import Roots, drop_duplicates, invert_3x3
 from snarfcli.deformer.skinning import forward_jacobian
 
 __all__ = ["complete_roots", "posed_cell_boxes"]

@@ -11,7 +11,7 @@ from torch import Tensor
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.ops import broyden_search, complete_search
-from snarfcli.deformer.search import invert_3x3
+from snarfcli.deformer.roots import invert_3x3
 from snarfcli.deformer.skinning import blend_transforms
 
 __all__ = ["Correspondences", "check_transforms", "find_correspondences"]

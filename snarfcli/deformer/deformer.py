@@ -14,7 +14,7 @@ from snarfcli.deformer.correspondences import Correspondences, check_transforms,
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
 from snarfcli.deformer.hierarchy import make_softmax
-from snarfcli.deformer.search import SearchConfig
+from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, interpolate, skin
 from snarfcli.deformer.weights import BonePrior, GridWeights, NetworkWeights, VoxelWeights, WeightField, total_variation
 

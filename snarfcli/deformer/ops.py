@@ -13,14 +13,14 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from snarfcli.deformer import cuda, native
 from snarfcli.deformer.blending import refuse_second_derivative
 from snarfcli.deformer.broyden import broyden_roots
 from snarfcli.deformer.complete import complete_roots
-from snarfcli.deformer.cuda_compile import nvrtc_version
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
-from snarfcli.deformer.library import choose_backend
-from snarfcli.deformer.search import Roots
+from snarfcli.deformer.roots import Roots
+from snarfcli.native import cpu, cuda
+from snarfcli.native.cuda_compile import nvrtc_version
+from snarfcli.native.library import choose_backend
 
 __all__ = ["broyden_search", "complete_search", "implicit_backward", "implicit_backward_reference"]
 
@@ -65,7 +65,7 @@ def complete_search(
     metres = tolerance * grid.longest_side
     if not points.is_cuda and choose_backend(backend) == "native":
         size = grid.cell_size(nodes)
-        found = native.complete_search(
+        found = cpu.complete_search(
             points, transforms, lower, size, nodes, active_cells, metres, max_steps, orientation_preserving
         )
     else:
@@ -106,7 +106,7 @@ def broyden_search(
         return cuda.broyden_search(points, transforms, starts, *box, tolerance, divergence, *rest, capacity)
     metres = (tolerance * grid.longest_side, divergence * grid.longest_side)
     if not points.is_cuda and choose_backend(backend) == "native":
-        found = native.broyden_search(points, transforms, starts, lower, grid.cell_size(nodes), nodes, *metres, *rest)
+        found = cpu.broyden_search(points, transforms, starts, lower, grid.cell_size(nodes), nodes, *metres, *rest)
     else:
         keys = ("exact_jacobian", "tolerance", "divergence", "max_steps")
         settings = dict(zip(keys, (exact_jacobian, *metres, max_steps), strict=True))
@@ -145,7 +145,7 @@ def implicit_backward(
     if gradient.is_cuda and _choose_cuda(backend) == "native":
         return cuda.implicit_backward(*roots, lower, upper, shape, batch, count, *wants)
     if not gradient.is_cuda and choose_backend(backend) == "native":
-        return native.implicit_backward(*roots, lower, grid.cell_size(nodes), nodes, batch, count, wants)
+        return cpu.implicit_backward(*roots, lower, grid.cell_size(nodes), nodes, batch, count, wants)
     return implicit_backward_reference(*roots, grid, nodes, batch, count, wants)
 
 

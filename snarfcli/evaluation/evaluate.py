@@ -35,7 +35,7 @@ class Field(Protocol):
 
 
 class Samples(Protocol):
-    """What is needed of the samples of a sequence; see `snarfcli.datasets.store.SequenceSamples`."""
+    """What is needed of the samples of a sequence; see `snarfcli.samples.store.SequenceSamples`."""
 
     name: str
     num_frames: int

@@ -16,7 +16,7 @@ from snarfcli.evaluation.metrics import FrameMetrics
 from snarfcli.progress import progress
 
 if TYPE_CHECKING:
-    from snarfcli.models.avatar import Avatar
+    from snarfcli.models.trained_field import TrainedField
 
 __all__ = ["EXTRA", "MISSING", "choose_extremes", "draw_frame", "write_figure"]
 
@@ -57,7 +57,7 @@ def choose_extremes(frames: Sequence[FrameMetrics], count: int) -> tuple[list[Fr
 
 def write_figure(
     path: str | Path,
-    avatar: Avatar,
+    avatar: TrainedField,
     sequences: Sequence[Samples],
     frames: Sequence[FrameMetrics],
     *,
@@ -76,7 +76,7 @@ def write_figure(
         resolution: voxels along the longest side of the predicted meshes.
         title: what the figure shows.
     """
-    from snarfcli.export.sheet import contact_sheet, write_png
+    from snarfcli.rendering.sheet import contact_sheet, write_png
 
     by_name = {sequence.name: sequence for sequence in sequences}
     worst, best = choose_extremes(frames, count)
@@ -101,7 +101,7 @@ def write_figure(
 
 
 def draw_frame(
-    avatar: Avatar, sequence: Samples, index: int, *, resolution: int, size: int = _PANEL
+    avatar: TrainedField, sequence: Samples, index: int, *, resolution: int, size: int = _PANEL
 ) -> tuple[list[np.ndarray | None], tuple[int, int]]:
     """Draw one frame from one camera: ground truth, prediction, and the points whose label was predicted wrong.
 
@@ -116,10 +116,10 @@ def draw_frame(
         Three pictures [size, size, 3] uint8, sRGB, None for the prediction where the field has no surface; and the
         numbers of missing and of extra points.
     """
-    from snarfcli.export.camera import Camera
-    from snarfcli.export.render import render
     from snarfcli.meshing.mesh import Mesh
     from snarfcli.meshing.surfaces import field_surface
+    from snarfcli.rendering.camera import Camera
+    from snarfcli.rendering.render import render
 
     truth = Mesh(sequence.vertices(index), sequence.faces(index))
     camera = Camera.framing(truth.vertices)

@@ -19,7 +19,7 @@ from snarfcli.evaluation.evaluate import Samples, choose_frames
 from snarfcli.progress import progress
 
 if TYPE_CHECKING:
-    from snarfcli.models.avatar import Avatar
+    from snarfcli.models.trained_field import TrainedField
 
 __all__ = ["F_SCORE_DISTANCE_M", "SurfaceMetrics", "compare_surfaces", "measure_surfaces", "sample_surface", "surfaces_text"]
 
@@ -41,7 +41,7 @@ class SurfaceMetrics:
     """Harmonic mean of the shares of points, of either surface, within 5 mm of the other."""
 
 
-def measure_surfaces(avatar: Avatar, sequences: Sequence[Samples], count: int, resolution: int) -> dict[str, Any]:
+def measure_surfaces(avatar: TrainedField, sequences: Sequence[Samples], count: int, resolution: int) -> dict[str, Any]:
     """Extract the avatar's surface in some frames, compare it with the true one, and return what `metrics.json` says of it.
 
     Args:

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from snarfcli.datasets.subjects import Template
-    from snarfcli.models.avatar import Avatar
+    from snarfcli.models.trained_field import TrainedField
 
 __all__ = ["compare_weights", "measure_weights", "weights_text"]
 
 _POINTS_AT_ONCE = 65_536
 
 
-def measure_weights(avatar: Avatar, template: Template | None) -> dict[str, Any] | None:
+def measure_weights(avatar: TrainedField, template: Template | None) -> dict[str, Any] | None:
     """Compare an avatar's weights with those of the subject's mesh; None where either has none.
 
     Args:

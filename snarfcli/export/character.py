@@ -29,11 +29,11 @@ from snarfcli.export.rig import (
 )
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
-from snarfcli.meshing.skinned import SkinnedSurface, skin_vertices
+from snarfcli.meshing.skinned import SkinnedSurface, skin_vertices, skinned_surface
 from snarfcli.progress import progress
 
 if TYPE_CHECKING:
-    from snarfcli.models.avatar import Avatar
+    from snarfcli.models.trained_field import TrainedField
 
 __all__ = [
     "Character",
@@ -127,7 +127,7 @@ def check_options(options: CharacterOptions) -> None:
     check_number("resolution", options.resolution, *RESOLUTIONS)
 
 
-def check_avatar(avatar: Avatar) -> None:
+def check_avatar(avatar: TrainedField) -> None:
     """Refuse an avatar that cannot be rigged.
 
     Raises:
@@ -140,7 +140,7 @@ def check_avatar(avatar: Avatar) -> None:
         )
 
 
-def character_surface(avatar: Avatar, options: CharacterOptions) -> SkinnedSurface:
+def character_surface(avatar: TrainedField, options: CharacterOptions) -> SkinnedSurface:
     """Return the avatar's skinned surface with at most the triangles that are wanted.
 
     Raises:
@@ -148,7 +148,7 @@ def character_surface(avatar: Avatar, options: CharacterOptions) -> SkinnedSurfa
     """
     check_avatar(avatar)
     try:
-        surface = avatar.skinned_surface(options.resolution)
+        surface = skinned_surface(avatar, options.resolution)
         if options.triangles is not None and len(surface.mesh.faces) > options.triangles:
             log.info("decimating %d triangles to %d", len(surface.mesh.faces), options.triangles)
             surface = SkinnedSurface(avatar, options.resolution, mesh=_decimated(surface.mesh, options.triangles))
@@ -178,7 +178,7 @@ def _decimated(mesh: Mesh, triangles: int) -> Mesh:
         raise UserError(str(error)) from None
 
 
-def build_character(avatar: Avatar, surface: SkinnedSurface, clips: Sequence[Clip], options: CharacterOptions) -> Character:
+def build_character(avatar: TrainedField, surface: SkinnedSurface, clips: Sequence[Clip], options: CharacterOptions) -> Character:
     """Make a character of an avatar in motion.
 
     Args:

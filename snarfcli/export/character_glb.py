@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from snarfcli.export.character import Character, CharacterClip
 from snarfcli.export.glb import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbBuilder
-from snarfcli.export.meshes import weights_to_colors
-from snarfcli.export.render import from_srgb
 from snarfcli.export.rig import decompose, local_frames
+from snarfcli.meshing.colors import from_srgb, weights_to_colors
 from snarfcli.meshing.mesh import vertex_normals
 
 __all__ = ["write_character"]

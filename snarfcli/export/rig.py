@@ -8,7 +8,7 @@ skinning (SNARF Eq. 4), for all weights exactly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,18 +17,28 @@ from scipy.spatial.transform import Rotation
 
 from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import nearest_rotation
+from snarfcli.meshing.mesh import Mesh
+from snarfcli.meshing.skinned import skin_vertices
 from snarfcli.motions import Motion
 
 __all__ = [
+    "HEIGHTS",
     "Clip",
     "LocalTransforms",
     "bind_frames",
     "clip_transforms",
     "decompose",
     "local_frames",
+    "lowest_point",
+    "on_ground",
     "recompose",
     "unique_names",
 ]
+
+HEIGHTS = ("auto", "ground", "file")
+"""How high a clip is: `ground`, its lowest point at y = 0; `file`, as its motion has it; `auto`, only built-in ones there."""
+
+_MOST_FRAMES = 200  # of a clip, evenly spread: a foot is on the ground for longer
 
 _IS_RIGID = 1e-5
 """How far a scale may be from 1, and axes from a right angle, to be taken for rounding of float32."""
@@ -112,6 +122,30 @@ def recompose(transforms: LocalTransforms, parents: Sequence[int]) -> NDArray[np
         if parent >= 0:
             local[..., joint, :, :] = local[..., parent, :, :] @ local[..., joint, :, :]
     return local
+
+
+def lowest_point(mesh: Mesh, skeleton: Skeleton, clip: Clip) -> float:
+    """Return the height of the lowest vertex of a canonical mesh with weights in a clip, metres."""
+    frames = np.unique(np.linspace(0, clip.motion.num_frames - 1, _MOST_FRAMES).astype(int))
+    transforms = clip_transforms(skeleton, clip)[frames]
+    return min(float(skin_vertices(mesh.vertices, mesh.weights, one)[:, 1].min()) for one in transforms)
+
+
+def on_ground(mesh: Mesh, skeleton: Skeleton, clip: Clip) -> tuple[Clip, float]:
+    """Return a clip moved up or down so that its lowest point is at y = 0, and by how much, metres.
+
+    Args:
+        mesh: canonical, with weights.
+        skeleton: the avatar's.
+        clip: what is moved, as a whole.
+    """
+    up = -lowest_point(mesh, skeleton, clip)
+    motion = replace(clip.motion, translation=clip.motion.translation + (0.0, up, 0.0))
+    transforms: NDArray | None = clip.bone_transforms
+    if transforms is not None:
+        transforms = np.array(transforms)
+        transforms[:, :, 1, 3] += up
+    return replace(clip, motion=motion, bone_transforms=transforms), up
 
 
 def unique_names(names: Sequence[str]) -> list[str]:

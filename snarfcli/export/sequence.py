@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from snarfcli.errors import UserError
-from snarfcli.export.meshes import MESH_WRITERS, weights_to_colors
 from snarfcli.export.rig import Clip
+from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.extract import EmptySurface, FullSurface
+from snarfcli.meshing.mesh_files import MESH_WRITERS
 from snarfcli.names import folder_names
 from snarfcli.progress import progress
 

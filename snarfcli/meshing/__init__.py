@@ -2,8 +2,9 @@
 
 from snarfcli.meshing.extract import EmptySurface, FullSurface, extract_surface
 from snarfcli.meshing.mesh import ExtractionStats, Mesh, vertex_normals
-from snarfcli.meshing.skinned import SkinnedSurface
-from snarfcli.meshing.surfaces import SURFACES, canonical_surface, field_surface, posed_mesh
+from snarfcli.meshing.posed import SURFACES, posed_mesh
+from snarfcli.meshing.skinned import SkinnedSurface, skinned_surface
+from snarfcli.meshing.surfaces import canonical_surface, field_surface
 
 __all__ = [
     "SURFACES",
@@ -16,5 +17,6 @@ __all__ = [
     "extract_surface",
     "field_surface",
     "posed_mesh",
+    "skinned_surface",
     "vertex_normals",
 ]

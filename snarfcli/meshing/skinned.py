@@ -12,12 +12,13 @@ from torch import Tensor
 
 from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
-from snarfcli.meshing.surfaces import AvatarLike, canonical_surface, check_posed, in_chunks
+from snarfcli.meshing.surfaces import canonical_surface, check_posed, in_chunks
+from snarfcli.models.trained_field import TrainedField
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-__all__ = ["Followed", "SkinnedSurface", "skin_vertices"]
+__all__ = ["Followed", "SkinnedSurface", "skin_vertices", "skinned_surface"]
 
 # The motion of the shape with the pose is found at the vertices of a coarser mesh, 2 cm apart on a body, and interpolated:
 # against finding it at every vertex of a mesh of 256, 0.2 to 0.4 mm off in the mean (benchmarks/bm_surfaces.py).
@@ -62,7 +63,7 @@ class SkinnedSurface:
     """
 
     def __init__(
-        self, avatar: AvatarLike, resolution: int = 256, *, keep_share: float = 0.01, mesh: Mesh | None = None
+        self, avatar: TrainedField, resolution: int = 256, *, keep_share: float = 0.01, mesh: Mesh | None = None
     ) -> None:
         self._avatar = avatar
         rest = avatar.skeleton.canonical_pose.float()
@@ -108,10 +109,26 @@ class SkinnedSurface:
         return replace(self.mesh, vertices=vertices, normals=vertex_normals(vertices, self.mesh.faces))
 
 
+def skinned_surface(avatar: TrainedField, resolution: int = 256, keep_share: float = 0.01) -> SkinnedSurface:
+    """Return the skinned surface of an avatar, computed once per resolution and share and kept with the avatar.
+
+    Args:
+        avatar: gives the canonical shape and the skinning weights.
+        resolution: voxels along the longest side of the canonical box.
+        keep_share: loose pieces with fewer faces than this share of the largest surface's are dropped.
+
+    Raises:
+        EmptySurface, FullSurface: the canonical field has no surface.
+        ValueError: the avatar has no skinning weights.
+    """
+    key = ("skinned_surface", resolution, keep_share)
+    return avatar.derived(key, lambda: SkinnedSurface(avatar, resolution, keep_share=keep_share))
+
+
 class Followed:
     """Points of the canonical surface that are followed along their normals as the pose changes the shape."""
 
-    def __init__(self, avatar: AvatarLike, pose: Tensor, mesh: Mesh) -> None:
+    def __init__(self, avatar: TrainedField, pose: Tensor, mesh: Mesh) -> None:
         self.avatar = avatar
         self.points = mesh.vertices
         self.normals = mesh.normals
@@ -188,7 +205,7 @@ def _neighbours(mesh: Mesh) -> csr_matrix:
     return (diags(1 / np.maximum(np.asarray(joined.sum(axis=1)).ravel(), 1)) @ joined).tocsr().astype(np.float32)
 
 
-def _settled(avatar: AvatarLike, pose: Tensor, mesh: Mesh) -> Mesh:
+def _settled(avatar: TrainedField, pose: Tensor, mesh: Mesh) -> Mesh:
     """Return a canonical mesh with its vertices on the level set of the shape in `pose`, with weights and normals."""
     mesh = mesh.with_normals()
     way, last_step = Followed(avatar, pose, mesh).nearest_ways(pose)

@@ -4,31 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from snarfcli.bodies import Skeleton
 from snarfcli.meshing.extract import extract_surface
 from snarfcli.meshing.mesh import Mesh
-
-if TYPE_CHECKING:
-    from snarfcli.meshing.skinned import SkinnedSurface
+from snarfcli.models.trained_field import TrainedField
 
 __all__ = [
-    "SURFACES",
-    "AvatarLike",
     "canonical_surface",
     "check_posed",
     "field_surface",
     "in_chunks",
     "limited",
-    "posed_mesh",
 ]
-
-SURFACES = ("field", "skinned")
 
 # Logits beyond this say no more than occupied or not, but would pull vertices onto lattice nodes: a point without a
 # correspondence has a very negative one.
@@ -39,31 +30,9 @@ _NEIGHBOURS = 8
 _DILATE = 0
 
 
-class AvatarLike(Protocol):
-    """What the surfaces need of an avatar, which moves what it is given to its device itself."""
-
-    skeleton: Skeleton
-
-    def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor: ...
-
-    def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor): ...
-
-    def canonical_logits(self, points_c: Tensor, pose: Tensor) -> Tensor: ...
-
-    def skinning_weights(self, points_c: Tensor) -> Tensor: ...
-
-    def skin(self, points_c: Tensor, bone_transforms: Tensor) -> Tensor: ...
-
-    def canonical_box(self) -> tuple[Tensor, Tensor]: ...
-
-    def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]: ...
-
-    def skinned_surface(self, resolution: int, keep_share: float) -> SkinnedSurface: ...
-
-
 @torch.no_grad()
 def field_surface(
-    avatar: AvatarLike,
+    avatar: TrainedField,
     pose: Tensor,
     translation: Tensor | None = None,
     resolution: int = 256,
@@ -103,7 +72,7 @@ def field_surface(
 
 @torch.no_grad()
 def canonical_surface(
-    avatar: AvatarLike,
+    avatar: TrainedField,
     pose: Tensor,
     resolution: int = 128,
     *,
@@ -127,34 +96,8 @@ def canonical_surface(
     return replace(mesh, weights=weights).with_normals()
 
 
-def posed_mesh(
-    avatar: AvatarLike,
-    pose: Tensor,
-    translation: Tensor | None = None,
-    resolution: int = 256,
-    *,
-    surface: str = "field",
-    weights_from: Mesh | None = None,
-    keep_share: float = 0.01,
-    transforms: Tensor | None = None,
-) -> Mesh:
-    """Return the surface of the kind `surface`, see `SURFACES`; `weights_from` serves `field` only.
-
-    Raises:
-        ValueError: `surface` is unknown.
-        EmptySurface, FullSurface: the field has no surface.
-    """
-    if surface == "field":
-        return field_surface(
-            avatar, pose, translation, resolution, weights_from=weights_from, keep_share=keep_share, transforms=transforms
-        )
-    if surface == "skinned":
-        return avatar.skinned_surface(resolution, keep_share).posed(pose, translation, transforms)
-    raise ValueError(f"surface: wanted one of {', '.join(SURFACES)}, got {surface!r}")
-
-
 def check_posed(
-    avatar: AvatarLike, pose: Tensor, translation: Tensor | None, transforms: Tensor | None
+    avatar: TrainedField, pose: Tensor, translation: Tensor | None, transforms: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Check the arguments; return the pose as float32 and the bone transforms [J, 4, 4]."""
     if pose.ndim != 2 or pose.shape[1] != 3:
@@ -175,7 +118,7 @@ def limited(logits: Tensor) -> Tensor:
     return logits.clamp(-_LARGEST_LOGIT, _LARGEST_LOGIT)
 
 
-def _skin(avatar: AvatarLike, transforms: Tensor, vertices_c: np.ndarray) -> np.ndarray:
+def _skin(avatar: TrainedField, transforms: Tensor, vertices_c: np.ndarray) -> np.ndarray:
     return in_chunks(lambda points_c: avatar.skin(points_c, transforms), vertices_c)
 
 
@@ -185,7 +128,7 @@ def in_chunks(function: Callable[[Tensor], Tensor], points: np.ndarray, chunk: i
     return torch.cat(parts).float().numpy()
 
 
-def _borrow_weights(avatar: AvatarLike, transforms: Tensor, mesh: Mesh, mesh_c: Mesh) -> np.ndarray:
+def _borrow_weights(avatar: TrainedField, transforms: Tensor, mesh: Mesh, mesh_c: Mesh) -> np.ndarray:
     """Return the weights [V, J] of the nearest vertex of `mesh_c`, posed, that faces the same way."""
     from scipy.spatial import cKDTree
 

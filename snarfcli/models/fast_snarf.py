@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from snarfcli.bodies import Skeleton
-from snarfcli.deformer import (
-    BonePrior,
-    CanonicalGrid,
-    Correspondences,
-    ForwardDeformer,
-    SearchConfig,
-    cells_near,
-)
+from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, SearchConfig, cells_near
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, MeshTemplate, System
 
-__all__ = ["FastSnarf", "blend"]
+__all__ = ["FastSnarf", "Snarf", "blend"]
 
 _SAMPLES_M = 0.04  # most distance of the samples that judge a cell; a wrist is 5 cm thick
 _KEPT_RADIUS_M = 0.1  # cells with a corner this near to a bone are searched whatever the field says
@@ -216,6 +210,16 @@ class FastSnarf(System):
             touched = self.occupied_cells(self._canonical_pose[None], reach_m=_SURFACE_MOVES_M)
             self._body_cells = touched if bool(touched.any()) else self.deformer.active_cells
         return self.deformer.posed_box(bone_transforms, self._body_cells)
+
+
+class Snarf(FastSnarf):
+    """Fast-SNARF without its grid: the field of `skinning` is a network, whose own roots are found.
+
+    Arguments: as `FastSnarf`; `skinning.name` is "mlp" whatever is given, and `search.name` must be "broyden".
+    """
+
+    def __init__(self, config: AvatarConfig, *others: Any, **named: Any) -> None:
+        super().__init__(replace(config, skinning=replace(config.skinning, name="mlp")), *others, **named)
 
 
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from typing import ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -16,13 +17,13 @@ from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
-from snarfcli.models.settings import ModelConfig
+from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import FieldSamples, MeshTemplate
 from snarfcli.precision import network_precision
 from snarfcli.segments import distance_to_segments
 from snarfcli.shape.network import LOGITS_PER_METRE
 
-__all__ = ["Nasa", "PartNetworks"]
+__all__ = ["Nasa", "PartNetworks", "Piecewise"]
 
 _LEAK = 0.1  # slope of the leaky ReLU for negative values (Deng et al.)
 _ON_SURFACE = 0.5  # wanted occupancy of a part at its own surface points (Deng et al.)
@@ -117,6 +118,16 @@ class Nasa(PointwiseSystem):
         wanted = _ON_SURFACE * F.one_hot(weights.argmax(1), self.num_bones).T.to(weights)
         occupancy = self.part_logits(posed, bone_transforms, precision).sigmoid()
         return {"parts": config.part_weight * F.mse_loss(occupancy, wanted.expand_as(occupancy))}
+
+
+class Piecewise(Nasa):
+    """NASA with parts that move rigidly and keep their shape.
+
+    Arguments: as `Nasa`; `model.part_code` is 0 whatever is given.
+    """
+
+    def __init__(self, config: AvatarConfig, *others: Any, **named: Any) -> None:
+        super().__init__(replace(config, model=replace(config.model, part_code=0)), *others, **named)
 
 
 def _own_segments(skeleton: Skeleton) -> Tensor:

@@ -12,10 +12,10 @@ from torch.nn import functional as F
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid, SearchConfig
 from snarfcli.deformer.skinning import skin
-from snarfcli.models.inference import can_evaluate, evaluate
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.precision import network_precision
 from snarfcli.shape import CONDITIONS, OccupancyNetwork, joints_of_bones
+from snarfcli.shape.inference import can_evaluate, evaluate
 
 __all__ = ["NO_CORRESPONDENCE", "FieldSamples", "MeshTemplate", "System", "pose_angles"]
 

@@ -1,9 +1,9 @@
 """Pose sequences: files of many kinds and the built-in motions."""
 
+from snarfcli.motions.body_shape import read_shape
 from snarfcli.motions.builtin import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, builtin_motion
 from snarfcli.motions.motion import Motion
 from snarfcli.motions.reader import MOTION_SUFFIXES, read_motion
-from snarfcli.motions.shape import read_shape
 
 __all__ = [
     "MOTION_SUFFIXES",

@@ -14,7 +14,7 @@ from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError
 from snarfcli.motions.layouts import BODY_JOINTS, FINGER_JOINTS, LAYOUTS, carry_over, layout_of
 from snarfcli.motions.motion import Motion
-from snarfcli.motions.world import Up, up_axis, y_up_from_z_up
+from snarfcli.motions.up_axis import Up, up_axis, y_up_from_z_up
 
 __all__ = ["DEFAULT_FRAME_RATE", "MAX_POSE_BYTES", "POSE_KEYS", "motion_from_arrays"]
 

@@ -21,7 +21,7 @@ from snarfcli.motions.arrays import MAX_POSE_BYTES, POSE_KEYS, motion_from_array
 from snarfcli.motions.layouts import HANDS
 from snarfcli.motions.motion import Motion
 from snarfcli.motions.retarget import choose_clip, retarget
-from snarfcli.motions.world import UPS, Up
+from snarfcli.motions.up_axis import UPS, Up
 
 __all__ = ["MOTION_SUFFIXES", "read_motion"]
 

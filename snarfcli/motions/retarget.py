@@ -27,7 +27,7 @@ from snarfcli.motions.layouts import layout_of
 from snarfcli.motions.mapping import map_joints
 from snarfcli.motions.motion import Motion
 from snarfcli.motions.rest_poses import RestMatch, rest_turns
-from snarfcli.motions.world import Up, up_axis, y_from_z_up
+from snarfcli.motions.up_axis import Up, up_axis, y_from_z_up
 
 __all__ = ["choose_clip", "retarget"]
 

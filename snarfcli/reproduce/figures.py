@@ -10,18 +10,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from snarfcli.datasets.store import SampleStore
+from snarfcli.avatar import Avatar
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import Samples, choose_frames
-from snarfcli.export import Camera, contact_sheet, render, weights_to_colors, write_png
 from snarfcli.files import atomic_path, read_json
+from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import canonical_surface, field_surface
-from snarfcli.models.avatar import Avatar
 from snarfcli.progress import progress
+from snarfcli.rendering import Camera, contact_sheet, render, write_png
 from snarfcli.reproduce.experiments import Row
 from snarfcli.reproduce.plans import Plan
 from snarfcli.reproduce.results import COLUMNS, Result, summarise
+from snarfcli.samples.store import SampleStore
 
 __all__ = ["draw_sequences", "draw_stick_curves", "draw_stick_shapes", "draw_systems", "draw_weights"]
 

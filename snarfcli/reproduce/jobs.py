@@ -12,11 +12,11 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from snarfcli.datasets.store import samples_folder
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.reproduce.locks import locked
 from snarfcli.reproduce.plans import Evaluation, Job
+from snarfcli.samples.store import samples_folder
 
 __all__ = ["LOG", "STATUS", "JobStopped", "Status", "is_evaluated", "read_status", "run_command", "run_job"]
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request, find_source
-from snarfcli.datasets.store import samples_folder
 from snarfcli.errors import UserError, nearest
 from snarfcli.reproduce.experiments import EXPERIMENTS, Experiment, Row
 from snarfcli.runs import run_folder
+from snarfcli.samples.store import samples_folder
 from snarfcli.settings import group_options, quote
 
 __all__ = ["Choice", "Evaluation", "Job", "Plan", "Samples", "choose_experiments", "make_plan", "unique_jobs"]

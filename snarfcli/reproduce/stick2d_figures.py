@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from snarfcli.bodies import Skeleton
-from snarfcli.datasets.store import SampleStore, SequenceSamples
 from snarfcli.evaluation.evaluate import Field, predict_inside
 from snarfcli.evaluation.metrics import iou
 from snarfcli.files import atomic_path
+from snarfcli.samples.store import SampleStore, SequenceSamples
 from snarfcli.sampling import in_turned_over, winding_numbers
 
 if TYPE_CHECKING:

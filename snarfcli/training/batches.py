@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
 from snarfcli.parallel import count_cores
+from snarfcli.samples.store import SampleStore
 from snarfcli.training.fresh import DrawnPoints, FreshPoints, draw_steps
 from snarfcli.training.prefetch import Prefetch
 from snarfcli.training.settings import TrainingConfig

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
 from snarfcli.models.extent import unpose_by_nearest_bone
+from snarfcli.samples.store import SampleStore
 
 __all__ = ["rough_canonical_points"]
 

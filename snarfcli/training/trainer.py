@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import iou
-from snarfcli.models.avatar import Avatar
 from snarfcli.models.extent import bone_owners, bone_segments
+from snarfcli.models.trained_field import TrainedField
 from snarfcli.precision import PRECISIONS, matmul_precision
+from snarfcli.samples.store import SampleStore
 from snarfcli.training.batches import Batch, load_frames, new_batches
 from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
 from snarfcli.training.settings import TrainingConfig
@@ -50,7 +50,7 @@ class Trainer:
     """
 
     def __init__(
-        self, avatar: Avatar, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device
+        self, avatar: TrainedField, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device
     ) -> None:
         if config.precision not in PRECISIONS:
             raise ValueError(f"training.precision must be one of {', '.join(PRECISIONS)}, got {config.precision!r}")
@@ -161,7 +161,7 @@ class Trainer:
         decay = min(self.config.average_decay, (1 + self.step) / (10 + self.step))
         torch._foreach_lerp_(self.average, [p.detach() for p in self.parameters], 1 - decay)
 
-    def averaged_avatar(self) -> Avatar:
+    def averaged_avatar(self) -> TrainedField:
         """Return a copy of the avatar with the averaged weights, ready to use."""
         avatar = copy.copy(self.avatar)
         avatar.model = copy.deepcopy(self.model)
@@ -171,7 +171,7 @@ class Trainer:
                 parameter.copy_(average)
         return avatar.to(self.device)
 
-    def finished_avatar(self) -> Avatar:
+    def finished_avatar(self) -> TrainedField:
         """Return the averaged avatar, with cells to search that fit the shape that it has in the training poses."""
         avatar = self.averaged_avatar()
         avatar.model.tighten_cells(self.batches.poses(_POSES_AT_THE_END), self.config.precision)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.export.glb import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbBuilder
-from snarfcli.export.render import from_srgb
+from snarfcli.meshing.colors import from_srgb
 
 __all__ = ["colored_glb"]
 

@@ -11,7 +11,7 @@ from snarfcli.viewer.motion_tab import MotionTab
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.pose_tab import PoseTab
 from snarfcli.viewer.scene import Scene
-from snarfcli.viewer.viewing import Viewing
+from snarfcli.viewer.state import Viewing
 
 __all__ = ["Controls"]
 

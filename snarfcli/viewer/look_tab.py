@@ -8,7 +8,7 @@ from typing import Any
 from snarfcli.viewer.inputs import on_user
 from snarfcli.viewer.picture import RESOLUTIONS, SURFACE_NAMES
 from snarfcli.viewer.scene import Scene
-from snarfcli.viewer.viewing import Viewing
+from snarfcli.viewer.state import Viewing
 
 __all__ = ["LookTab"]
 

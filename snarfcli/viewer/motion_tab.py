@@ -8,7 +8,7 @@ from typing import Any
 from snarfcli.errors import UserError
 from snarfcli.viewer.inputs import on_user
 from snarfcli.viewer.picture import Picture
-from snarfcli.viewer.viewing import Viewing
+from snarfcli.viewer.state import Viewing
 
 __all__ = ["NO_MOTION", "MotionTab"]
 

@@ -11,7 +11,7 @@ from snarfcli.viewer.inputs import AngleSliders, on_user, rounded
 from snarfcli.viewer.joints import joint_labels, pose_file
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.scene import Scene
-from snarfcli.viewer.viewing import Viewing
+from snarfcli.viewer.state import Viewing
 
 __all__ = ["PoseTab"]
 

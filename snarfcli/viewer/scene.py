@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from snarfcli.viewer.body import Posed
 from snarfcli.viewer.joints import global_turns, posed_joints, vector_from_turn
 from snarfcli.viewer.picture import Picture
+from snarfcli.viewer.state import Viewing
 from snarfcli.viewer.surfaces import ShownSurface
-from snarfcli.viewer.viewing import Viewing
 
 __all__ = ["BODY_COLOR", "Scene"]
 

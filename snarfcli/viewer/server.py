@@ -18,7 +18,7 @@ from snarfcli.viewer.body import Body
 from snarfcli.viewer.controls import Controls
 from snarfcli.viewer.picture import Look
 from snarfcli.viewer.scene import Scene
-from snarfcli.viewer.viewing import Viewing
+from snarfcli.viewer.state import Viewing
 
 __all__ = ["ViewServer", "can_open_browser", "check_port", "is_loopback", "require_viser"]
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.export.meshes import weights_to_colors
+from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.viewer.colored import colored_glb
 
 __all__ = ["ShownSurface"]

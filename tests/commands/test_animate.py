@@ -14,14 +14,14 @@ import trimesh
 from PIL import Image
 from toy_avatar import LENGTH, RADIUS, ToyAvatar
 
-from snarfcli.cli import main
-from snarfcli.commands import animate, choices
+from snarfcli.avatar import Avatar
+from snarfcli.cli.main import main
+from snarfcli.commands import animate, selection
 from snarfcli.commands.animate import AnimateConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.skinned import SkinnedSurface
-from snarfcli.models.avatar import Avatar
 from snarfcli.motions import Motion
 
 VOLUME = np.pi * RADIUS**2 * 2 * LENGTH + 4 / 3 * np.pi * RADIUS**3
@@ -380,7 +380,7 @@ def test_another_skeleton_moves_as_its_samples_do(config, toy, tmp_path, monkeyp
         asked.append(arguments[1:4])
         return motion, transforms
 
-    monkeypatch.setattr(choices, "stored_motion", stored)
+    monkeypatch.setattr(selection, "stored_motion", stored)
     other = replace(config, data=DataConfig("meshes", 1, 1, 1), pose=None, motion=None, ckpt=str(tmp_path / "avatar.pt"))
     (tmp_path / "avatar.pt").write_bytes(b"the toy")
     assert run(replace(other, output=str(tmp_path / "out"))) == 0

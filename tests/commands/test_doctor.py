@@ -7,10 +7,10 @@ import sys
 
 import pytest
 
-from snarfcli import cli
+from snarfcli.cli import main as cli
 from snarfcli.commands import doctor
 from snarfcli.commands.doctor import DoctorConfig
-from snarfcli.deformer import library
+from snarfcli.native import library
 
 
 def report(caplog, data_root, output_root) -> dict[str, str]:
@@ -70,7 +70,7 @@ def test_a_broken_section_does_not_end_the_report(caplog, tmp_path, monkeypatch)
 
 
 def test_it_runs_without_pytorch(tmp_path):
-    code = "import sys; sys.modules['torch'] = None; from snarfcli.cli import main; raise SystemExit(main(['doctor']))"
+    code = "import sys; sys.modules['torch'] = None; from snarfcli.cli.main import main; raise SystemExit(main(['doctor']))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "cannot be imported" in done.stdout and "libigl" in done.stdout and "Traceback" not in done.stdout + done.stderr

@@ -12,13 +12,13 @@ import pytest
 import torch
 from toy_training import avatar_config, new_avatar, toy_store
 
+from snarfcli.avatar import Avatar
 from snarfcli.commands.evaluate import EvalConfig, run
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.store import SampleStore
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.evaluation import evaluate as module
-from snarfcli.models.avatar import Avatar
+from snarfcli.samples.store import SampleStore
 
 
 @pytest.fixture(scope="module")

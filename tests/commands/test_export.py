@@ -14,11 +14,11 @@ import trimesh
 from glb_reader import GlbReader
 from toy_character import JOINTS, ToyCharacter, wave
 
-from snarfcli.cli import main
-from snarfcli.commands import choices
+from snarfcli.cli.main import main
+from snarfcli.commands import selection
 from snarfcli.errors import UserError
 from snarfcli.export import blender
-from snarfcli.export.exporting import ExportReport
+from snarfcli.export.export import ExportReport
 from snarfcli.export.sequence import atomic_folder
 from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.skinned import SkinnedSurface
@@ -30,7 +30,7 @@ SMALL = ("resolution=40", "triangles=400", "device=cpu")
 def toy(monkeypatch) -> ToyCharacter:
     avatar = ToyCharacter()
     avatar.facts = {"subject": "50002"}
-    monkeypatch.setattr(choices.Avatar, "load", classmethod(lambda cls, path, device: avatar))
+    monkeypatch.setattr(selection.Avatar, "load", classmethod(lambda cls, path, device: avatar))
     return avatar
 
 
@@ -232,7 +232,7 @@ def test_a_crash_leaves_nothing(folder, capsys, monkeypatch):
     assert code == 2 and "the disk is full" in err
     monkeypatch.undo()
     monkeypatch.chdir(folder.parents[3])
-    monkeypatch.setattr(choices.Avatar, "load", classmethod(lambda cls, path, device: ToyCharacter()))
+    monkeypatch.setattr(selection.Avatar, "load", classmethod(lambda cls, path, device: ToyCharacter()))
     posed, calls = SkinnedSurface.posed, []
 
     def crash(self, *arguments):
@@ -305,7 +305,7 @@ def test_an_avatar_without_surface_is_a_line(folder, capsys, monkeypatch, logit,
 def test_an_avatar_without_weights_is_refused(folder, toy, capsys, monkeypatch):
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
     code, err = export(capsys, "--pose", pose_file("walk.npz"))
-    assert code == 2 and "a rig needs skinning weights of canonical points, which model toy does not have" in err
+    assert code == 2 and "a rig needs skinning weights of canonical points, which model fast_snarf does not have" in err
     assert not (folder / "export").exists()
 
 

@@ -20,11 +20,11 @@ from snarfcli.commands.preprocess import PreprocessConfig
 from snarfcli.datasets.posed_meshes import FileMeshes, PosedMeshes
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
-from snarfcli.datasets.store import SampleStore
 from snarfcli.datasets.subjects import SubjectData
-from snarfcli.datasets.writing import SequenceWriter
 from snarfcli.errors import UserError
 from snarfcli.formats.surfaces import read_surface
+from snarfcli.samples.store import SampleStore
+from snarfcli.samples.writing import SequenceWriter
 from snarfcli.sampling import occupancies
 
 

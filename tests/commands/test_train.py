@@ -11,11 +11,11 @@ import pytest
 import torch
 from toy_training import avatar_config, toy_store, training_config
 
+from snarfcli.avatar import Avatar
 from snarfcli.commands.train import TrainConfig, run
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import Avatar
+from snarfcli.samples.store import SampleStore
 from snarfcli.training.trainer import Trainer
 
 FILES = {"avatar.pt", "checkpoint.pt", "config.yaml", "metrics.json", "tensorboard"}

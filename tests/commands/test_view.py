@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from toy_avatar import ToyAvatar
 
-from snarfcli.cli import main
+from snarfcli.avatar import Avatar
+from snarfcli.cli.main import main
 from snarfcli.commands import view
 from snarfcli.commands.view import ViewConfig, run, start
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import Avatar
 from snarfcli.viewer.server import ViewServer, check_port
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")

@@ -11,13 +11,13 @@ import torch
 from licensed_files import write_body, write_cape
 
 from snarfcli.bodies import load_body
-from snarfcli.datasets.preprocessing import preprocess_subject
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request, find_source
 from snarfcli.datasets.splits import split_sequences
-from snarfcli.datasets.store import SampleStore
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
+from snarfcli.samples.preprocessing import preprocess_subject
+from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import SamplingSettings
 
 

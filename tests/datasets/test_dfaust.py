@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from licensed_files import BETAS, amass_poses, write_body, write_dfaust, write_new, write_old
 
-from snarfcli.cli import main
+from snarfcli.cli.main import main
 from snarfcli.datasets.amass import papers_split
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request, find_source

@@ -14,14 +14,14 @@ from toy_animal import ANIMAL_CLIPS, Animal, AnimalMotion, animal_motion, make_a
 from toy_animal_files import animal_glb, write_animal_bvh, write_animal_meshes, write_mesh
 
 from snarfcli.datasets import meshes
-from snarfcli.datasets.preprocessing import preprocess_subject
-from snarfcli.datasets.recordings import World
+from snarfcli.datasets.recorded_sequence import World
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
-from snarfcli.datasets.store import SampleStore
-from snarfcli.datasets.stored_motion import stored_motion
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
+from snarfcli.samples.preprocessing import preprocess_subject
+from snarfcli.samples.store import SampleStore
+from snarfcli.samples.stored_motion import stored_motion
 from snarfcli.sampling import SamplingSettings
 
 FRAMES = 5

@@ -184,7 +184,7 @@ import sys, torch
 sys.path[:0] = {paths!r}
 from skinning_scenes import scene, unit_grid
 from snarfcli.deformer import find_correspondences
-from snarfcli.deformer.library import native_library
+from snarfcli.native.library import native_library
 points, transforms, weights = scene(count=500, angle=1.2)
 found = find_correspondences(points, transforms, weights, unit_grid(torch.float32), backend="native")
 import ctypes

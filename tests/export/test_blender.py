@@ -15,7 +15,7 @@ from toy_character import JOINTS, ToyCharacter, wave
 from snarfcli.errors import UserError
 from snarfcli.export.blender import convert, find_blender
 from snarfcli.export.character import CharacterOptions
-from snarfcli.export.exporting import export_character
+from snarfcli.export.export import export_character
 from snarfcli.export.rig import Clip
 
 try:

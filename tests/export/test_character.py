@@ -15,7 +15,7 @@ from toy_character import BULGE, FRAME_RATE, JOINTS, ToyCharacter, stretched, wa
 from snarfcli.errors import UserError
 from snarfcli.export import character_glb
 from snarfcli.export.character import CharacterOptions, character_surface
-from snarfcli.export.exporting import export_character
+from snarfcli.export.export import export_character
 from snarfcli.export.rig import Clip
 from snarfcli.formats.gltf import read_gltf
 from snarfcli.meshing.extract import EmptySurface
@@ -210,7 +210,7 @@ def test_colors_are_linear(toy, tmp_path):
     export_character(toy, tmp_path / "worm.glb", [Clip(wave(2))], replace(FEW, weight_colors=True))
     reader = GlbReader(tmp_path / "worm.glb")
     color = reader.attribute("COLOR_0")
-    from snarfcli.export.meshes import weights_to_colors
+    from snarfcli.meshing.colors import weights_to_colors
 
     wanted = weights_to_colors(character_surface(toy, FEW).mesh.weights) / 255
     back = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
@@ -319,7 +319,7 @@ def test_without_weights_or_motions_there_is_no_character(toy, tmp_path, monkeyp
     with pytest.raises(UserError, match="no motion to export"):
         export_character(toy, tmp_path / "worm.glb", [], FEW)
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
-    with pytest.raises(UserError, match="a rig needs skinning weights of canonical points, which model toy does not have"):
+    with pytest.raises(UserError, match="a rig needs skinning weights of canonical points, which model fast_snarf does not have"):
         export_character(toy, tmp_path / "worm.glb", [Clip(wave(2))], FEW)
 
 

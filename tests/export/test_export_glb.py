@@ -9,9 +9,9 @@ from glb_reader import GlbReader
 from toy_character import FRAME_RATE, ToyCharacter, stretched, wave
 from toy_training import avatar_config
 
+from snarfcli.avatar import Avatar
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import Avatar
 
 SMALL = {"triangles": None, "resolution": 32}
 

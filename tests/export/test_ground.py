@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from toy_character import ToyCharacter, wave
 
-from snarfcli.export.ground import lowest_point, on_ground
-from snarfcli.export.rig import Clip, clip_transforms
+from snarfcli.export.rig import Clip, clip_transforms, lowest_point, on_ground
 from snarfcli.meshing.skinned import skin_vertices
 
 TOY = ToyCharacter()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from analytic_avatar import capsule
 from scipy.ndimage import gaussian_filter, map_coordinates
-from toy_avatar import capsule
 
 from snarfcli.meshing.extract import EmptySurface, FullSurface, extract_surface
 from snarfcli.meshing.mesh import Mesh

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from analytic_avatar import capsule
 from torch import Tensor
-from toy_avatar import LENGTH, RADIUS, ToyAvatar, capsule
+from toy_avatar import LENGTH, RADIUS, ToyAvatar
 
 from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.mesh import Mesh

@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 from toy_avatar import LENGTH, RADIUS, ToyAvatar
 
 from snarfcli.meshing.extract import EmptySurface
-from snarfcli.meshing.surfaces import canonical_surface, field_surface, posed_mesh
+from snarfcli.meshing.posed import posed_mesh
+from snarfcli.meshing.surfaces import canonical_surface, field_surface
 
 VOLUME = np.pi * RADIUS**2 * 2 * LENGTH + 4 / 3 * np.pi * RADIUS**3
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 from toy_training import avatar_config
 
+from snarfcli.avatar import Avatar
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.grid import locate
 from snarfcli.models import fast_snarf
-from snarfcli.models.avatar import Avatar
 
 RADIUS = 0.07
 

@@ -7,12 +7,13 @@ import pickle
 import pytest
 import torch
 
+from snarfcli.avatar import Avatar
 from snarfcli.deformer import Correspondences
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import FORMAT, FORMAT_VERSION, Avatar
 from snarfcli.models.fast_snarf import blend
 from snarfcli.models.settings import ModelConfig
 from snarfcli.models.system import NO_CORRESPONDENCE
+from snarfcli.models.trained_field import FORMAT, FORMAT_VERSION
 
 
 def correspondences(query, batch, count):

@@ -10,15 +10,15 @@ from toy_training import avatar_config, new_avatar, training_config
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton
 from snarfcli.datasets.posed_meshes import RigMeshes
-from snarfcli.datasets.preprocessing import preprocess_subject
-from snarfcli.datasets.store import SampleStore
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
-from snarfcli.meshing.surfaces import posed_mesh
+from snarfcli.meshing.posed import posed_mesh
 from snarfcli.models.extent import bone_segments
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.motions import Motion
+from snarfcli.samples.preprocessing import preprocess_subject
+from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import SamplingSettings
 from snarfcli.training.trainer import Trainer
 

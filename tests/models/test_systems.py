@@ -10,15 +10,16 @@ from torch import nn
 from torch.nn import functional as F
 from toy_training import avatar_config, toy_store, training_config
 
+from snarfcli.avatar import Avatar
 from snarfcli.deformer import CanonicalGrid, SearchConfig
 from snarfcli.deformer.skinning import skin
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import SYSTEMS, Avatar
 from snarfcli.models.nasa import PartNetworks
 from snarfcli.models.pointwise import invert_blended
 from snarfcli.models.settings import ModelConfig
 from snarfcli.models.smpl_nn import nearest_vertex
 from snarfcli.models.system import MeshTemplate
+from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.shape import ConditionConfig
 from snarfcli.training.extent import rough_canonical_points
 from snarfcli.training.trainer import Trainer

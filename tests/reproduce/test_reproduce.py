@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 from toy_training import toy_store
 
-from snarfcli import cli
+from snarfcli.cli import main as cli
 from snarfcli.commands import reproduce
 from snarfcli.commands.reproduce import ReproduceConfig, run
 from snarfcli.reproduce.jobs import JobStopped, run_job

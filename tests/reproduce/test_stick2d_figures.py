@@ -10,11 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
-from snarfcli.datasets.preprocessing import preprocess_subject
 from snarfcli.datasets.stick2d import stick_subject
-from snarfcli.datasets.store import SampleStore
 from snarfcli.reproduce import stick2d_figures
 from snarfcli.reproduce.stick2d_figures import draw_curves, draw_shapes, extreme_poses
+from snarfcli.samples.preprocessing import preprocess_subject
+from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import SamplingSettings, in_turned_over, winding_numbers
 
 

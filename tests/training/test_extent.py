@@ -9,10 +9,10 @@ from toy_training import new_avatar
 
 from snarfcli.bodies import Skeleton
 from snarfcli.datasets.posed_meshes import ArrayMeshes
-from snarfcli.datasets.preprocessing import preprocess_subject
-from snarfcli.datasets.store import SampleStore
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.motions import Motion
+from snarfcli.samples.preprocessing import preprocess_subject
+from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import SamplingSettings
 
 

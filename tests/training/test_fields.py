@@ -12,13 +12,13 @@ import torch
 from toy_subject import toy_body
 from toy_training import avatar_config, toy_store, training_config
 
+from snarfcli.avatar import Avatar
 from snarfcli.commands.evaluate import EvalConfig
 from snarfcli.commands.evaluate import run as evaluate
 from snarfcli.commands.train import TrainConfig, new_trainer, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import Avatar
 
 FIELDS = ["distilled", "voxel", "mlp", "preset"]
 

@@ -14,9 +14,9 @@ import torch
 from toy_subject import capsule_mesh, toy_subject
 from toy_training import new_avatar, toy_store, training_config
 
-from snarfcli.datasets.preprocessing import preprocess_subject
-from snarfcli.datasets.store import SampleStore
 from snarfcli.errors import UserError
+from snarfcli.samples.preprocessing import preprocess_subject
+from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import SamplingSettings
 from snarfcli.training.batches import FreshBatches, new_batches
 from snarfcli.training.fresh import FreshPoints

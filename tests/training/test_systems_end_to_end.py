@@ -12,17 +12,18 @@ import pytest
 import torch
 from toy_training import avatar_config, toy_store, training_config
 
+from snarfcli.avatar import Avatar
 from snarfcli.commands import animate
 from snarfcli.commands.evaluate import EvalConfig
 from snarfcli.commands.evaluate import run as evaluate
 from snarfcli.commands.train import TrainConfig, run
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.store import SampleStore
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import SYSTEMS, Avatar
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.settings import ModelConfig
+from snarfcli.models.trained_field import SYSTEMS
+from snarfcli.samples.store import SampleStore
 from snarfcli.shape import ConditionConfig
 from snarfcli.training import trainer as trainer_module
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Diverged

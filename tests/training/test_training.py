@@ -8,8 +8,8 @@ import pytest
 import torch
 from toy_training import avatar_config, new_avatar, toy_store, training_config
 
+from snarfcli.avatar import Avatar
 from snarfcli.errors import UserError
-from snarfcli.models.avatar import Avatar
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.extent import unpose_by_nearest_bone
 from snarfcli.training.loop import train

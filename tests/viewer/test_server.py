@@ -179,7 +179,7 @@ def test_who_leaves_lets_go_of_the_handle(server, monkeypatch):
 
 def test_an_avatar_without_weights_has_no_choice_of_surface():
     avatar = ToyAvatar()
-    avatar.has_skinning_weights = False
+    avatar.model.has_skinning_weights = False
     server = ViewServer(avatar, SMALL)
     try:
         with Page(server.server) as page:

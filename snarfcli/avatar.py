@@ -1,0 +1,82 @@
+"""The avatar: the trained field of one subject, its surfaces, and its rigged character."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from snarfcli.export.character import CharacterOptions
+from snarfcli.export.export import ExportReport, export_character
+from snarfcli.export.rig import Clip
+from snarfcli.meshing.mesh import Mesh
+from snarfcli.meshing.posed import posed_mesh
+from snarfcli.meshing.skinned import SkinnedSurface, skinned_surface
+from snarfcli.models.trained_field import TrainedField
+from snarfcli.motions import Motion
+
+__all__ = ["Avatar"]
+
+
+class Avatar(TrainedField):
+    """An animatable avatar of one subject."""
+
+    def skinned_surface(self, resolution: int = 256, keep_share: float = 0.01) -> SkinnedSurface:
+        """Return the canonical mesh that `mesh(surface="skinned")` poses, computed once; see `meshing.skinned_surface`."""
+        return skinned_surface(self, resolution, keep_share)
+
+    def mesh(
+        self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field"
+    ) -> Mesh:
+        """Return the posed mesh of one pose.
+
+        Args:
+            pose: [J, 3] or [1, J, 3] axis-angle, radians, global orientation included.
+            translation: [3] or [1, 3], metres.
+            resolution: voxels along the longest side.
+            surface: "field" (the union of all correspondences, watertight) or "skinned" (the canonical mesh moved by
+                linear blend skinning, with its weights; after the first one nearly for free, always with the same faces).
+
+        Raises:
+            ValueError: `surface` is neither, the system cannot skin a surface, or the field has none in this pose.
+        """
+        pose = torch.as_tensor(pose).reshape(-1, 3)
+        translation = None if translation is None else torch.as_tensor(translation).reshape(3)
+        return posed_mesh(self, pose, translation, resolution, surface=surface)
+
+    def export_glb(
+        self,
+        path: str | Path,
+        motions: Motion | Clip | Sequence[Motion | Clip],
+        *,
+        triangles: int | None = 20000,
+        influences: int = 4,
+        morph_targets: int = 8,
+        resolution: int = 256,
+        weight_colors: bool = False,
+        overwrite: bool = False,
+    ) -> ExportReport:
+        """Write a rigged, animated character as one `.glb` file, whole or not at all; `snarf export` does the same.
+
+        Args:
+            path: the file.
+            motions: a clip each; a `Clip` where joints stretch, so that it needs bone transforms.
+            triangles: at most; None leaves the mesh as it was extracted.
+            influences: joints that move one vertex, 4 or 8.
+            morph_targets: shapes that are blended for the pose-dependent shape, at most; 0 for the mean shape.
+            resolution: voxels along the longest side of the canonical box.
+            weight_colors: whether vertices are coloured by their skinning weights.
+            overwrite: whether a file that is there already is replaced.
+
+        Returns:
+            What was written, and how near it comes to `mesh(surface="skinned")`.
+
+        Raises:
+            ValueError: the system has no skinning weights, the field no surface, or an argument cannot be used.
+        """
+        several = [motions] if isinstance(motions, Motion | Clip) else motions
+        clips = [motion if isinstance(motion, Clip) else Clip(motion) for motion in several]
+        options = CharacterOptions(triangles, influences, morph_targets, resolution, weight_colors)
+        return export_character(self, path, clips, options, overwrite=overwrite)

@@ -1,0 +1,1 @@
+"""The command line: flags become Hydra overrides; help, and messages for user errors."""

@@ -1,0 +1,64 @@
+"""Checks of the settings of weight fields and searches, before any work starts."""
+
+from __future__ import annotations
+
+import math
+
+from snarfcli.checks import check_choice, check_number
+from snarfcli.deformer import SearchConfig, SkinningConfig
+from snarfcli.deformer.deformer import FIELDS
+from snarfcli.deformer.hierarchy import SOFTMAXES
+from snarfcli.deformer.search_config import JACOBIANS, SEARCHES
+from snarfcli.errors import UserError
+
+__all__ = ["check_search", "check_skinning"]
+
+
+def check_search(search: SearchConfig) -> None:
+    """Refuse settings of the correspondence search that do not fit together; bones are checked where their number is known.
+
+    Raises:
+        UserError: one does not fit.
+    """
+    check_choice("search.name", search.name, SEARCHES)
+    check_choice("search.jacobian", search.jacobian, JACOBIANS)
+    check_choice("search.backend", search.backend, ("auto", "native", "reference"))
+    if search.name == "complete" and search.init_bones is not None:
+        raise UserError("search.init_bones is for search=broyden; the complete search has no start bones")
+    if search.name == "complete" and search.jacobian != "exact":
+        raise UserError("search.jacobian=broyden is for search=broyden; the complete search has the exact one at hand")
+    check_number("search.max_steps", search.max_steps, 1)
+    for name, value in (("tolerance", search.tolerance), ("divergence", search.divergence)):
+        if not 0 < value < math.inf:
+            raise UserError(f"search.{name} must be positive, got {value}")
+
+
+def check_skinning(skinning: SkinningConfig, search: SearchConfig) -> None:
+    """Refuse settings of the weight field that cannot be used, or that do not go with the search.
+
+    Raises:
+        UserError: one does not fit.
+    """
+    check_choice("skinning.name", skinning.name, FIELDS)
+    check_choice("skinning.softmax", skinning.softmax, SOFTMAXES)
+    for name, least in (("resolution", 2), ("margin_m", 0)):
+        values = getattr(skinning, name)
+        if len(values) != 3:
+            raise UserError(f"skinning.{name} must be three numbers, along x, y and z, got {values}")
+        for value in values:
+            check_number(f"skinning.{name}", value, least)
+    for name in ("width", "depth"):
+        check_number(f"skinning.{name}", getattr(skinning, name), 1)
+    check_number("skinning.smoothness", skinning.smoothness, 0)
+    for name in ("sharpness", "prior_falloff_m"):
+        value = getattr(skinning, name)
+        if value is not None and not 0 < value < math.inf:
+            raise UserError(f"skinning.{name} must be positive, got {value}")
+    if skinning.smoothness and skinning.name != "voxel":
+        raise UserError("skinning.smoothness is for skinning=voxel; the other fields are smooth by themselves")
+    if skinning.weights_file is not None and skinning.name != "preset":
+        raise UserError("skinning.weights_file is for skinning=preset; the other fields are learned")
+    if skinning.name == "preset" and skinning.weights_file is None:
+        raise UserError("skinning=preset needs skinning.weights_file=FILE, an .npz file with vertices and weights")
+    if skinning.name == "mlp" and search.name != "broyden":
+        raise UserError("skinning=mlp has no cells to search; leave search out, or give search=snarf or search=broyden")

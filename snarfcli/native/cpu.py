@@ -1,0 +1,246 @@
+"""The CPU library's functions on tensors: what csrc/include/snarf/api.h declares, without the pointers."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import Structure, byref, c_double, c_int32, c_int64, c_void_p
+
+import torch
+from torch import Tensor
+
+from snarfcli.native.library import native_library
+
+__all__ = ["blend", "blend_backward", "broyden_search", "complete_search", "implicit_backward"]
+
+
+class _Field(Structure):
+    _fields_ = [
+        ("transforms", c_void_p),
+        ("lower", c_double * 3),
+        ("size", c_double * 3),
+        ("nodes", c_int32 * 3),
+        ("bytes_per_number", c_int32),
+    ]
+
+
+class _Queries(Structure):
+    _fields_ = [("points", c_void_p), ("poses", c_int64), ("count", c_int64), ("threads", c_int32)]
+
+
+class _Complete(Structure):
+    _fields_ = [
+        ("active", c_void_p),
+        ("tolerance", c_double),
+        ("max_steps", c_int32),
+        ("orientation_preserving", c_int32),
+    ]
+
+
+class _Broyden(Structure):
+    _fields_ = [
+        ("starts", c_void_p),
+        ("count", c_int64),
+        ("tolerance", c_double),
+        ("divergence", c_double),
+        ("max_steps", c_int32),
+        ("exact_jacobian", c_int32),
+        ("orientation_preserving", c_int32),
+    ]
+
+
+class _Blending(Structure):
+    _fields_ = [
+        ("weights", c_void_p),
+        ("bones", c_void_p),
+        ("active", c_void_p),
+        ("poses", c_int64),
+        ("count", c_int64),
+        ("nodes", c_int32 * 3),
+        ("bytes_per_number", c_int32),
+        ("threads", c_int32),
+    ]
+
+
+def blend(weights: Tensor, bones: Tensor, active: Tensor | None) -> Tensor:
+    """Blend bone transforms [B, J, 12] with the weights [D, H, W, J] of the grid's nodes to [B, D * H * W, 12].
+
+    With `active` [D-1, H-1, W-1] only the corners of these cells are blended; other nodes get zeros.
+    """
+    weights, bones, active = _blending_inputs(weights, bones, active)
+    out = weights.new_empty(len(bones), weights[..., 0].numel(), 12)
+    blending = _blending(weights, bones, active)
+    _raise_for(_library().snarf_blend(byref(blending), c_void_p(out.data_ptr())))
+    return out
+
+
+def blend_backward(
+    gradient: Tensor, weights: Tensor, bones: Tensor, active: Tensor | None, wants: tuple[bool, bool]
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients by the weights and by the bones from that by `blend`'s result; empty where not wanted."""
+    gradient = gradient.contiguous()
+    weights, bones, active = _blending_inputs(weights, bones, active)
+    v_weights = torch.empty_like(weights) if wants[0] else weights.new_empty(0)
+    v_bones = torch.empty_like(bones) if wants[1] else bones.new_empty(0)
+    blending = _blending(weights, bones, active)
+    results = [c_void_p(out.data_ptr() if wanted else None) for out, wanted in zip((v_weights, v_bones), wants, strict=True)]
+    _raise_for(_library().snarf_blend_backward(byref(blending), c_void_p(gradient.data_ptr()), *results))
+    return v_weights, v_bones
+
+
+def complete_search(
+    points: Tensor,
+    transforms: Tensor,
+    lower: Tensor,
+    size: Tensor,
+    shape: tuple[int, int, int],
+    active: Tensor | None,
+    tolerance: float,
+    max_steps: int,
+    orientation_preserving: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the roots in every active cell.
+
+    Args:
+        points: queries [B, N, 3], posed space, metres.
+        transforms: blended transforms [B, D * H * W, 12] at the nodes.
+        lower: canonical position of the first node, [3], metres.
+        size: sides of a cell, [3], metres.
+        shape: nodes (D, H, W).
+        active: bool [D-1, H-1, W-1]; None for all cells.
+        tolerance: largest residual of a root, metres.
+        max_steps: most Newton steps from one start.
+        orientation_preserving: keep only roots where the Jacobian's determinant is positive.
+
+    Returns:
+        canonical [M, 3], query [M] (b * N + n, ascending) and the inverse of dd/dx, [M, 3, 3].
+    """
+    points, transforms = points.contiguous(), transforms.contiguous()
+    active = None if active is None else active.contiguous()
+    cells = None if active is None else active.data_ptr()
+    settings = _Complete(cells, tolerance, max_steps, orientation_preserving)
+    field = _field(transforms, lower, size, shape)
+    return _search("snarf_complete_search", field, points, settings)
+
+
+def broyden_search(
+    points: Tensor,
+    transforms: Tensor,
+    starts: Tensor,
+    lower: Tensor,
+    size: Tensor,
+    shape: tuple[int, int, int],
+    tolerance: float,
+    divergence: float,
+    max_steps: int,
+    exact_jacobian: bool,
+    orientation_preserving: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Run Broyden's method from every start; arguments and results as in `complete_search`.
+
+    Args:
+        starts: upper three rows of the inverse bone transforms, [B, I, 12], posed to canonical.
+        divergence: residual at which a start is given up, metres.
+        exact_jacobian: whether the inverse Jacobian is the exact one at the root or the iteration's approximation.
+    """
+    points, transforms, starts = points.contiguous(), transforms.contiguous(), starts.contiguous()
+    settings = _Broyden(
+        starts.data_ptr(), starts.shape[1], tolerance, divergence, max_steps, exact_jacobian, orientation_preserving
+    )
+    return _search("snarf_broyden_search", _field(transforms, lower, size, shape), points, settings)
+
+
+def implicit_backward(
+    gradient: Tensor,
+    canonical: Tensor,
+    query: Tensor,
+    jacobian_inverse: Tensor,
+    lower: Tensor,
+    size: Tensor,
+    shape: tuple[int, int, int],
+    batch: int,
+    count: int,
+    wants: tuple[bool, bool],
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients by the queries [B, N, 3] and by the nodes' transforms [B, D * H * W, 12]; empty where not wanted.
+
+    Args:
+        gradient: of the loss by the roots, [M, 3]; the other arrays as the search returned them.
+        wants: which of the two results are needed.
+    """
+    gradient, canonical = gradient.contiguous(), canonical.contiguous()
+    query, jacobian_inverse = query.contiguous(), jacobian_inverse.contiguous()
+    v_points = gradient.new_empty((batch, count, 3) if wants[0] else 0)
+    v_transforms = gradient.new_empty((batch, shape[0] * shape[1] * shape[2], 12) if wants[1] else 0)
+    field = _field(gradient, lower, size, shape)
+    queries = _Queries(None, batch, count, torch.get_num_threads())
+    code = _library().snarf_implicit_backward(
+        byref(field),
+        byref(queries),
+        c_int64(len(query)),
+        c_void_p(gradient.data_ptr()),
+        c_void_p(canonical.data_ptr()),
+        c_void_p(query.data_ptr()),
+        c_void_p(jacobian_inverse.data_ptr()),
+        c_void_p(v_points.data_ptr() if wants[0] else None),
+        c_void_p(v_transforms.data_ptr() if wants[1] else None),
+    )
+    _raise_for(code)
+    return v_points, v_transforms
+
+
+def _blending_inputs(weights: Tensor, bones: Tensor, active: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:
+    return weights.contiguous(), bones.contiguous(), None if active is None else active.contiguous()
+
+
+def _blending(weights: Tensor, bones: Tensor, active: Tensor | None) -> _Blending:
+    """Describe contiguous inputs, which the caller keeps alive."""
+    depth, height, width, count = weights.shape
+    return _Blending(
+        weights.data_ptr(),
+        bones.data_ptr(),
+        None if active is None else active.data_ptr(),
+        len(bones),
+        count,
+        (c_int32 * 3)(width, height, depth),
+        weights.element_size(),
+        torch.get_num_threads(),
+    )
+
+
+def _library() -> ctypes.CDLL:
+    library = native_library()
+    if library is None:
+        raise RuntimeError("the native library is not available")
+    return library
+
+
+def _field(numbers: Tensor, lower: Tensor, size: Tensor, shape: tuple[int, int, int]) -> _Field:
+    """Describe the grid; `numbers` [B, V, 12] gives the address and the type."""
+    nodes = (c_int32 * 3)(shape[2], shape[1], shape[0])
+    return _Field(
+        numbers.data_ptr(), (c_double * 3)(*lower.tolist()), (c_double * 3)(*size.tolist()), nodes, numbers.element_size()
+    )
+
+
+def _search(function: str, field: _Field, points: Tensor, settings: Structure) -> tuple[Tensor, Tensor, Tensor]:
+    library = _library()
+    queries = _Queries(points.data_ptr(), points.shape[0], points.shape[1], torch.get_num_threads())
+    handle, found = c_void_p(), c_int64()
+    _raise_for(getattr(library, function)(byref(field), byref(queries), byref(settings), byref(handle), byref(found)))
+    try:
+        canonical = points.new_empty(found.value, 3)
+        inverse = points.new_empty(found.value, 3, 3)
+        query = torch.empty(found.value, dtype=torch.long)
+    except BaseException:
+        library.snarf_take_roots(handle, None, None, None)
+        raise
+    results = (c_void_p(result.data_ptr()) for result in (canonical, query, inverse))
+    _raise_for(library.snarf_take_roots(handle, *results))
+    return canonical, query, inverse
+
+
+def _raise_for(code: int) -> None:
+    if code == 2:
+        raise MemoryError("the correspondence search ran out of memory; give fewer points or poses at once")
+    if code:
+        raise RuntimeError(f"the native library refused its arguments (code {code})")

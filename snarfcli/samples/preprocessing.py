@@ -1,0 +1,300 @@
+"""From a subject's motions to its store of samples: pose the meshes, sample them on several processes, write and resume."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import logging
+import platform
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from snarfcli.datasets.subjects import SequenceSpec, SubjectData
+from snarfcli.errors import UserError, nearest
+from snarfcli.parallel import run_in_processes
+from snarfcli.progress import progress
+from snarfcli.samples.finished import complete_sequences, frame_arrays, frame_numbers, write_subject
+from snarfcli.samples.store import samples_folder
+from snarfcli.samples.writing import (
+    SequenceWriter,
+    discard_samples,
+    hold_folder,
+    refuse_other_settings,
+    remove_leftovers,
+    write_manifest,
+)
+from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, sample_frames
+
+__all__ = ["preprocess_subject"]
+
+log = logging.getLogger(__name__)
+
+_FRAMES_PER_TASK = 30  # 3 to 4 s of work for 0.4 s of starting a process; the samples depend on it, see snarfcli/parallel.py
+_FRAMES_CHECKED = 200  # that a process only reads
+_PACKAGES = ("snarf", "numpy", "torch", "libigl", "pymeshlab", "trimesh", "embreex")
+
+
+@dataclass
+class _Job:
+    """One sequence that is being made."""
+
+    spec: SequenceSpec
+    arrays: dict[str, np.ndarray]
+    writer: SequenceWriter
+    frames_left: int
+    is_broken: bool = False
+
+
+def preprocess_subject(
+    subject: SubjectData,
+    root: str | Path,
+    sampling: SamplingSettings,
+    frame_steps: Mapping[str, int],
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
+    sequences: Sequence[str] = (),
+    skip_broken: bool = False,
+) -> dict[str, Any]:
+    """Make the samples of one subject, or those that are still missing, and return the manifest.
+
+    Args:
+        subject: skeleton and sequences.
+        root: the data folder; the samples go under `processed/{data}/{subject}`.
+        sampling: how points are chosen and labelled.
+        frame_steps: for each split, every how many frames of the motion one is taken.
+        workers: number of processes.
+        overwrite: discard the samples that are there.
+        sequences: names of the sequences to make, all if empty.
+        skip_broken: leave out sequences that cannot be used, and say so, instead of stopping.
+
+    Raises:
+        UserError: the samples there were made with other settings or from other motion, a sequence is unknown or cannot be
+            used, or another process works in the same folder.
+        OSError: the disk is full or cannot be written to. Sequences that were complete stay; nothing half-made does.
+    """
+    broken = _report_broken(subject, sequences, skip_broken)
+    chosen = _choose(subject, sequences)
+    sampling = replace(sampling, is_planar=subject.is_planar)
+    settings = {
+        "data": subject.data,
+        "subject": subject.subject,
+        # said of planar subjects only, so that the settings of others are those that their samples were made with before
+        **{name: value for name, value in vars(sampling).items() if name != "is_planar" or value},
+        **{f"{split}_frame_step": step for split, step in frame_steps.items()},
+    }
+    folder = samples_folder(root, subject.data, subject.subject)
+    with hold_folder(folder):
+        try:
+            remove_leftovers(folder)
+            new = [spec for spec in chosen if overwrite or not (folder / spec.split / spec.name / "sequence.json").exists()]
+            unusable = _check_files(subject, new, frame_steps, sampling.inside_test, workers, skip_broken)
+            broken += unusable
+            chosen = [spec for spec in chosen if spec.name not in dict(unusable)]
+            if overwrite:
+                discard_samples(folder)
+            refuse_other_settings(folder, settings)
+            started = time.monotonic()
+            write_subject(folder, subject, sampling.inside_test)
+            done = complete_sequences(folder, subject, settings, frame_steps)
+            missing = [spec for spec in chosen if (spec.split, spec.name) not in done]
+            if len(missing) < len(chosen):
+                log.info("%d of %d sequences are there already", len(chosen) - len(missing), len(chosen))
+            made = _make_sequences(folder, subject, missing, sampling, settings, workers, broken if skip_broken else None)
+            done.update({(entry["split"], entry["name"]): entry for entry in made})
+            if not done:
+                raise UserError(f"subject {subject.subject} of {subject.data} data has no sequence that can be used")
+            seconds = time.monotonic() - started
+            entries = [done[spec.split, spec.name] for spec in subject.sequences if (spec.split, spec.name) in done]
+            header = {
+                "made_by": "snarf preprocess",
+                "data": subject.data,
+                "subject": subject.subject,
+                "sources": list(subject.sources),
+                "skipped": [{"name": name, "reason": reason} for name, reason in dict([*subject.broken, *broken]).items()],
+                "settings": settings,
+                "versions": _versions(),
+            }
+            manifest = write_manifest(folder, header, entries)
+        except BaseException as error:
+            remove_leftovers(folder)
+            if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+                error.filename = str(folder)  # a write to a full disk does not say where
+            raise
+    _report(manifest, sum(entry["frames"] for entry in made), sampling.points_per_frame, seconds)
+    return manifest
+
+
+def _report_broken(subject: SubjectData, names: Sequence[str], skip_broken: bool) -> list[tuple[str, str]]:
+    """Return the sequences that the data set could not read, among those asked for; refuse them unless they may be left out."""
+    broken = [(name, reason) for name, reason in subject.broken if not names or name in names]
+    if broken and not skip_broken:
+        name, reason = broken[0]
+        more = f" ({len(broken) - 1} more like it)" if len(broken) > 1 else ""
+        raise UserError(f"sequence {name} cannot be used: {reason}{more}; give skip_broken=true to leave such sequences out")
+    for name, reason in broken:
+        log.warning("left out: sequence %s (%s)", name, reason)
+    return broken
+
+
+def _check_files(
+    subject: SubjectData,
+    specs: Sequence[SequenceSpec],
+    frame_steps: Mapping[str, int],
+    inside_test: str,
+    workers: int,
+    skip_broken: bool,
+) -> list[tuple[str, str]]:
+    """Read every mesh that comes from a file once, before any other work: return the sequences that cannot be used, and why.
+
+    Raises:
+        UserError: there is one, and such sequences may not be left out.
+    """
+    frames = {spec.name: frame_numbers(spec, frame_steps) for spec in specs if spec.meshes.source(0)}
+    parts = [
+        (spec, frames[spec.name][start : start + _FRAMES_CHECKED])
+        for spec in specs
+        for start in range(0, len(frames.get(spec.name, ())), _FRAMES_CHECKED)
+    ]
+    if not parts:
+        return []
+    broken: dict[str, str] = {}
+    results = run_in_processes(
+        check_frames, ((spec.meshes.chosen(part), inside_test, spec.name, part) for spec, part in parts), workers
+    )
+    total = sum(len(part) for _, part in parts)
+    try:
+        for task, problem in progress(results, total=total, desc=f"checking {subject.subject}", unit="meshes"):
+            name = parts[task][0].name
+            if problem is None or name in broken:
+                continue
+            if not skip_broken:
+                raise UserError(f"{problem.message}; give skip_broken=true to leave such sequences out")
+            log.warning("left out: sequence %s (%s)", name, problem.message)
+            broken[name] = problem.message
+    finally:
+        results.close()
+    return list(broken.items())
+
+
+def _choose(subject: SubjectData, names: Sequence[str]) -> list[SequenceSpec]:
+    known = [spec.name for spec in subject.sequences]
+    for name in names:
+        if name not in known and name not in (broken for broken, _ in subject.broken):
+            raise UserError(f"subject {subject.subject} has no sequence '{name}'{nearest(name, known)}")
+    return [spec for spec in subject.sequences if not names or spec.name in names]
+
+
+def _make_sequences(
+    folder: Path,
+    subject: SubjectData,
+    specs: Sequence[SequenceSpec],
+    sampling: SamplingSettings,
+    settings: Mapping[str, Any],
+    workers: int,
+    broken: list[tuple[str, str]] | None,
+) -> list[dict[str, Any]]:
+    """Sample and write sequences; each appears when its last frame is in. Return their descriptions.
+
+    One that turns out to be unusable is added to `broken`, or is an error if that is None.
+    """
+    steps = {split: settings[f"{split}_frame_step"] for split in ("train", "test", "ood")}
+    jobs: list[_Job] = []
+    places: list[tuple[_Job, int]] = []  # of each task: its sequence, and the next frame that it will send
+
+    def tasks() -> Iterator[tuple[Any, ...]]:
+        for spec in specs:
+            frames = frame_numbers(spec, steps)
+            arrays = frame_arrays(subject.skeleton, spec, frames)
+            writer = SequenceWriter(folder / spec.split / spec.name, len(frames), sampling.points_per_frame)
+            job = _Job(spec, arrays, writer, len(frames))
+            jobs.append(job)
+            for start in range(0, len(frames), _FRAMES_PER_TASK):
+                if job.is_broken:
+                    break
+                places.append((job, start))
+                part = frames[start : start + _FRAMES_PER_TASK]
+                yield spec.meshes.chosen(part), sampling, (subject.subject, spec.name), part
+
+    made = []
+    total = sum(len(frame_numbers(spec, steps)) for spec in specs)
+    results = run_in_processes(sample_frames, tasks(), workers)
+    try:
+        for task, samples in progress(results, total=total, desc=f"preprocess {subject.subject}", unit="frames"):
+            job, frame = places[task]
+            places[task] = (job, frame + 1)
+            if isinstance(samples, BrokenFrame):
+                if broken is None:
+                    raise UserError(f"{samples.message}; give skip_broken=true to leave such sequences out")
+                if not job.is_broken:
+                    log.warning("left out: sequence %s (%s)", job.spec.name, samples.message)
+                    broken.append((job.spec.name, samples.message))
+                    job.is_broken = True
+                    job.writer.discard()
+            if job.is_broken:
+                continue
+            job.writer.write_frame(frame, samples)
+            job.frames_left -= 1
+            if job.frames_left == 0:
+                description = {
+                    "name": job.spec.name,
+                    "split": job.spec.split,
+                    "frame_rate": job.spec.motion.frame_rate,
+                    "source": job.spec.meshes.fingerprint(),
+                    "settings": settings,
+                }
+                made.append(job.writer.finish(job.arrays, description))
+                job.arrays = {}
+                _report_sequence(made[-1])
+    finally:
+        results.close()
+        for job in jobs:
+            job.writer.discard()
+    return made
+
+
+def _report_sequence(entry: Mapping[str, Any]) -> None:
+    open_mesh = f", open meshes (up to {entry['boundary_edges']} boundary edges)" if entry["boundary_edges"] else ""
+    log.info(
+        "%s/%s: %d frames, %.2f %% of the points inside, %.3f %% self-intersecting%s",
+        entry["split"], entry["name"], entry["frames"],
+        100 * entry["inside_share"], 100 * entry["self_intersecting_share"], open_mesh,
+    )  # fmt: skip
+    if entry["inside_share"] == 0:
+        log.warning("warning: no point of %s is inside; are its meshes surfaces of a body, with faces outward?", entry["name"])
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions
+
+
+def _report(manifest: Mapping[str, Any], frames: int, points_per_frame: int, seconds: float) -> None:
+    counts = manifest["frames"]
+    all_frames = sum(counts.values())
+    if frames:
+        log.info(
+            "%d frames, %d samples in %.1f s: %.1f frames/s, %.0f samples/s",
+            frames, frames * points_per_frame, seconds, frames / seconds, frames * points_per_frame / seconds,
+        )  # fmt: skip
+    log.info(
+        "subject %s of %s data: %d train, %d test, %d ood frames, %.1f MB on disk, %.0f bytes a frame",
+        manifest["subject"], manifest["data"], counts["train"], counts["test"], counts["ood"],
+        manifest["bytes"] / 1e6, manifest["bytes"] / max(1, all_frames),
+    )  # fmt: skip
+    if counts["train"] and not counts["test"] and not counts["ood"]:
+        log.warning("warning: no sequence is held out, so nothing can be evaluated; name some with data.test=[NAME]")
+    if all(entry["boundary_edges"] == 0 for entry in manifest["sequences"]):
+        log.info(
+            "self-intersecting: winding number and ray parity label %.3f %% of the points differently",
+            100 * manifest["self_intersecting_share"],
+        )

@@ -1,0 +1,283 @@
+"""Writing the store of processed samples: whole sequences or nothing, one kind of settings to a folder."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from snarfcli.errors import UserError
+from snarfcli.files import atomic_path, file_digest, read_json, write_json
+from snarfcli.samples.store import FORMAT_VERSION, SEQUENCE_FILES, SPLITS, check_format
+from snarfcli.sampling.points import FrameSamples
+
+__all__ = [
+    "SequenceWriter",
+    "describe_files",
+    "discard_samples",
+    "hold_folder",
+    "refuse_other_settings",
+    "remove_leftovers",
+    "settings_digest",
+    "write_arrays",
+    "write_manifest",
+]
+
+_PARTIAL = ".partial"
+_SPOOL = "meshes.spool"
+
+
+def settings_digest(settings: Mapping[str, Any]) -> str:
+    """Return a short name for settings: equal for equal settings, whatever their order."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def describe_files(folder: Path, names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return the size and the SHA-256 of files, as a manifest lists them."""
+    return {name: {"bytes": (folder / name).stat().st_size, "sha256": file_digest(folder / name)} for name in names}
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write an `.npz` archive, whole or not at all."""
+    with atomic_path(path) as temporary:
+        np.savez(temporary, **arrays)
+
+
+class SequenceWriter:
+    """Writes one sequence under a temporary name, frame by frame in any order; it appears when it is complete."""
+
+    def __init__(self, folder: Path, num_frames: int, num_points: int) -> None:
+        """Start the sequence that will be `folder`.
+
+        Raises:
+            OSError: the folder cannot be written to.
+        """
+        self.folder = folder
+        self._partial = folder.with_name(f".{folder.name}{_PARTIAL}")
+        shutil.rmtree(self._partial, ignore_errors=True)
+        self._partial.mkdir(parents=True)
+        self._shape = (num_frames, num_points)
+        self._cubes = np.zeros((num_frames, 4), np.float32)
+        self._boxes = np.zeros((num_frames, 2, 3), np.float32)
+        self._inside = self._differing = self._boundary_edges = 0
+        self._topologies: dict[bytes, tuple[int, int, int]] = {}  # by digest: number, place in the spool, how many faces
+        self._topology = np.zeros(num_frames, np.int64)
+        self._spooled = np.zeros((num_frames, 2), np.int64)  # of each frame's vertices: their place in the spool, and how many
+        self._points = self._occupancies = self._spool = None
+        try:
+            self._points, self._points_start = _start_array(self._partial / "points.npy", (*self._shape, 3), "<u2")
+            packed = (num_frames, num_points // 8)
+            self._occupancies, self._bits_start = _start_array(self._partial / "occupancies.npy", packed, "|u1")
+            self._spool = open(self._partial / _SPOOL, "w+b")  # noqa: SIM115  closed by finish or discard
+        except BaseException:
+            self.discard()
+            raise
+
+    def write_frame(self, frame: int, samples: FrameSamples) -> None:
+        """Write the points, the labels and the mesh of frame number `frame` of this sequence."""
+        num_points = self._shape[1]
+        # plain writes, not a memory map: a full disk is then an error that can be reported, not a bus error
+        self._points.seek(self._points_start + frame * num_points * 6)
+        self._points.write(np.ascontiguousarray(samples.points, "<u2").data)
+        self._occupancies.seek(self._bits_start + frame * (num_points // 8))
+        self._occupancies.write(np.packbits(samples.occupied).data)
+        # how many vertices the frames before this one have is not known yet, so they are put in order by `finish`
+        self._spooled[frame] = self._spool.tell(), len(samples.vertices)
+        self._spool.write(np.ascontiguousarray(samples.vertices, "<u8").data)
+        self._topology[frame] = self._topology_of(samples.faces)
+        self._cubes[frame, :3], self._cubes[frame, 3] = samples.cube_lower, samples.cube_size
+        self._boxes[frame] = samples.box_lower, samples.box_upper
+        self._inside += int(samples.occupied.sum())
+        self._differing += samples.differing
+        self._boundary_edges = max(self._boundary_edges, samples.boundary_edges)
+
+    def _topology_of(self, faces: np.ndarray) -> int:
+        """Return the number of a list of faces among those seen so far; a new one is spooled, as scans have one a frame."""
+        content = np.ascontiguousarray(faces, "<i4")
+        digest = hashlib.sha256(content.data).digest()
+        if digest not in self._topologies:
+            self._topologies[digest] = len(self._topologies), self._spool.tell(), len(content)
+            self._spool.write(content.data)
+        return self._topologies[digest][0]
+
+    def finish(self, arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> dict[str, Any]:
+        """Complete the sequence once every frame is written, and return what its `sequence.json` says.
+
+        Args:
+            arrays: what `frames.npz` holds besides cubes, boxes and where each mesh starts, [T, ...] each.
+            description: entries of `sequence.json` besides counts, shares and checksums; `settings` among them.
+        """
+        self._points.close()
+        self._occupancies.close()
+        vertex_start = self._write_spooled("vertices.npy", self._spooled, (), "<u8")
+        _, first, topology = np.unique(self._topology, return_index=True, return_inverse=True)
+        order = np.argsort(first)  # the topologies in the order in which the frames have them
+        places = np.array([place for _, *place in self._topologies.values()])
+        face_start = self._write_spooled("faces.npy", places[order], (3,), "<i4")
+        self._spool.close()
+        (self._partial / _SPOOL).unlink()
+        meshes = {"vertex_start": vertex_start, "face_start": face_start, "topology": np.argsort(order)[topology]}
+        cubes = {"cube_lower": self._cubes[:, :3], "cube_size": self._cubes[:, 3]}
+        boxes = {"box_lower": self._boxes[:, 0], "box_upper": self._boxes[:, 1]}
+        write_arrays(self._partial / "frames.npz", {**arrays, **cubes, **boxes, **meshes})
+        frames, num_points = self._shape
+        complete = {
+            "format_version": FORMAT_VERSION,
+            **description,
+            "settings_digest": settings_digest(description["settings"]),
+            "frames": frames,
+            "points_per_frame": num_points,
+            "inside_share": self._inside / (frames * num_points),
+            "self_intersecting_share": self._differing / (frames * num_points),
+            "boundary_edges": self._boundary_edges,
+            "files": describe_files(self._partial, SEQUENCE_FILES),
+        }
+        write_json(self._partial / "sequence.json", complete)
+        if self.folder.exists():
+            shutil.rmtree(self.folder)
+        os.replace(self._partial, self.folder)
+        return complete
+
+    def _write_spooled(self, name: str, places: np.ndarray, row: tuple[int, ...], dtype: str) -> np.ndarray:
+        """Write an array of parts of the spool, given by place and number of rows; return where each starts, and the end."""
+        starts = np.concatenate([[0], np.cumsum(places[:, 1])])
+        file, _ = _start_array(self._partial / name, (int(starts[-1]), *row), dtype)
+        size = np.dtype(dtype).itemsize * math.prod(row)
+        with file:
+            for place, count in places:
+                self._spool.seek(int(place))
+                file.write(self._spool.read(int(count) * size))
+        return starts
+
+    def discard(self) -> None:
+        """Leave nothing of an unfinished sequence behind; harmless after `finish`."""
+        for file in (self._points, self._occupancies, self._spool):
+            if file is not None:
+                with contextlib.suppress(OSError):  # a full disk shows again when the buffer is flushed
+                    file.close()
+        shutil.rmtree(self._partial, ignore_errors=True)
+
+
+def _start_array(path: Path, shape: tuple[int, ...], dtype: str) -> tuple[Any, int]:
+    """Open a `.npy` file to be filled in, and return it with the position of its first value."""
+    file = open(path, "wb")  # noqa: SIM115  closed by the writer
+    try:
+        header = {"descr": dtype, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
+        return file, file.tell()
+    except BaseException:
+        with contextlib.suppress(OSError):
+            file.close()
+        raise
+
+
+def refuse_other_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Refuse to add samples to a folder whose samples were made with other settings.
+
+    Raises:
+        UserError: what is there differs; the message names each differing setting, or the format version.
+    """
+    for path in [folder / "manifest.json", *sorted(folder.glob("*/*/sequence.json"))]:
+        if not path.exists():
+            continue
+        there = read_json(path, "samples")
+        check_format(there, folder)
+        before = there.get("settings", {})
+        names = [name for name in {**settings, **before} if settings.get(name) != before.get(name)]
+        if names:
+            changes = ", ".join(f"{name} {before.get(name)} -> {settings.get(name)}" for name in names)
+            raise UserError(
+                f"the samples in {folder} were made with other settings ({changes}); "
+                "keep those settings, or start again with overwrite=true"
+            )
+
+
+def discard_samples(folder: Path) -> None:
+    """Delete the samples in a subject's folder; files that are not ours stay."""
+    for name in ("manifest.json", "subject.npz"):  # the manifest first: without it there is no store
+        (folder / name).unlink(missing_ok=True)
+    for split in SPLITS:
+        if (folder / split).is_dir():
+            shutil.rmtree(folder / split)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what an interrupted run left unfinished: partial sequences, a subject without sequences, empty folders."""
+    for partial in folder.glob(f"*/.*{_PARTIAL}"):
+        shutil.rmtree(partial, ignore_errors=True)
+    if not any(folder.glob("*/*/sequence.json")):
+        with contextlib.suppress(OSError):
+            (folder / "subject.npz").unlink(missing_ok=True)
+    for empty in (*(folder / split for split in SPLITS), folder):
+        with contextlib.suppress(OSError):
+            empty.rmdir()
+
+
+@contextlib.contextmanager
+def hold_folder(folder: Path) -> Iterator[None]:
+    """Make `folder` and hold it alone while the block runs, where the system can lock folders.
+
+    Raises:
+        UserError: another process holds it.
+        OSError: the folder cannot be made.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(f"another snarf preprocess is working in {folder}; wait for it, or end it first") from None
+        except OSError:
+            pass  # some network file systems have no locks
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def write_manifest(folder: Path, header: Mapping[str, Any], sequences: list[dict[str, Any]]) -> dict[str, Any]:
+    """Write the manifest of a subject, which makes its samples a store, and return it.
+
+    Args:
+        folder: the subject's folder, with `subject.npz` in it.
+        header: `data`, `subject`, `settings` and whatever else says what made the samples.
+        sequences: contents of the `sequence.json` of each sequence, in the order of the data set.
+    """
+    total = sum(entry["frames"] * entry["points_per_frame"] for entry in sequences)
+
+    def share(name: str) -> float:
+        weighted = (entry[name] * entry["frames"] * entry["points_per_frame"] for entry in sequences)
+        return sum(weighted) / total if total else 0.0
+
+    files = describe_files(folder, ("subject.npz",))
+    sizes = [entry["bytes"] for described in (files, *(s["files"] for s in sequences)) for entry in described.values()]
+    manifest = {
+        "format_version": FORMAT_VERSION,
+        **header,
+        "settings_digest": settings_digest(header["settings"]),
+        "frames": {split: sum(s["frames"] for s in sequences if s["split"] == split) for split in SPLITS},
+        "points": total,
+        "bytes": sum(sizes),
+        "inside_share": share("inside_share"),
+        "self_intersecting_share": share("self_intersecting_share"),
+        "files": files,
+        "sequences": [
+            {key: value for key, value in entry.items() if key not in ("settings", "settings_digest", "format_version")}
+            for entry in sequences
+        ],
+    }
+    write_json(folder / "manifest.json", manifest)
+    return manifest

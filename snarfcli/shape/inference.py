@@ -1,0 +1,150 @@
+"""The occupancy network without gradients on a CPU, by the native library: several times faster than layer by layer."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Iterator
+from ctypes import Structure, byref, c_float, c_int32, c_int64, c_void_p
+
+import torch
+from torch import Tensor
+
+from snarfcli.native.library import native_library
+from snarfcli.shape import OccupancyNetwork
+from snarfcli.shape.network import LOGITS_PER_METRE, SOFTPLUS_SHARPNESS
+
+__all__ = ["can_evaluate", "evaluate"]
+
+_ACTIVATIONS = {"relu": 1, "softplus": 2}
+
+
+class _Layer(Structure):
+    _fields_ = [
+        ("weights", c_void_p),
+        ("bias", c_void_p),
+        ("outputs", c_int32),
+        ("takes_point", c_int32),
+        ("takes_extras", c_int32),
+        ("activation", c_int32),
+    ]
+
+
+class _Network(Structure):
+    _fields_ = [
+        ("layers", c_void_p),
+        ("layer_count", c_int32),
+        ("frequencies", c_void_p),
+        ("frequency_count", c_int32),
+        ("segments", c_void_p),
+        ("segment_count", c_int32),
+        ("radius", c_float),
+        ("slope", c_float),
+        ("sharpness", c_float),
+        ("extra_count", c_int32),
+    ]
+
+
+def can_evaluate(network: torch.nn.Module, points: Tensor) -> bool:
+    """Return whether `evaluate` can stand in for the network's own forward pass: no gradient, float32, CPU, and a library."""
+    return (
+        isinstance(network, OccupancyNetwork)
+        and not torch.is_grad_enabled()
+        and not torch.compiler.is_compiling()
+        and points.device.type == "cpu"
+        and points.dtype == network.layers[0].bias.dtype == torch.float32
+        and native_library() is not None
+    )
+
+
+def evaluate(
+    network: OccupancyNetwork, canonical: Tensor, condition: Tensor, pose: Tensor, seen: Tensor | None = None
+) -> Tensor:
+    """Return what `network(canonical, condition, pose, seen)` returns, to rounding: logits [M] at canonical points [M, 3].
+
+    Args:
+        network: in full precision on the CPU.
+        canonical: [M, 3] float32, metres.
+        condition: pose condition of each pose, [B, C].
+        pose: index of each point's pose, [M], 0 to B - 1.
+        seen: how much each point sees of each part of the condition, [M, P]; all of it if None.
+
+    Raises:
+        MemoryError: there is not enough memory.
+    """
+    logits = canonical.new_empty(len(canonical))
+    for number, one in enumerate(condition):
+        if len(condition) == 1:
+            logits[:] = _evaluate(network, canonical, one, seen)
+        else:
+            own = (pose == number).nonzero()[:, 0]
+            logits[own] = _evaluate(network, canonical[own], one, None if seen is None else seen[own])
+    return logits
+
+
+def _evaluate(network: OccupancyNetwork, canonical: Tensor, condition: Tensor, seen: Tensor | None) -> Tensor:
+    """Evaluate points of one pose; `condition` [C]."""
+    config = network.config
+    extras = seen.float().contiguous() if network.conditioned and seen is not None else None
+    count = 0 if extras is None else extras.shape[1]
+    tensors = list(_layer_tensors(network, condition, count))  # they must outlive the call, as all else that is pointed to
+    layers = (_Layer * len(tensors))()
+    for index, (weight, bias) in enumerate(tensors):
+        layers[index] = _Layer(
+            weight.data_ptr(),
+            bias.data_ptr(),
+            len(bias),
+            index == 0 or index in config.skip_layers,
+            count > 0 and index == config.condition_layer,
+            _ACTIVATIONS[config.activation] if index < config.depth else 0,
+        )
+    points, frequencies, bones = (values.float().contiguous() for values in (canonical, network.frequencies, network.bones))
+    native = _Network(
+        ctypes.cast(layers, c_void_p),
+        len(layers),
+        frequencies.data_ptr(),
+        len(frequencies),
+        bones.data_ptr(),
+        0 if config.prior_radius_m is None else len(bones),
+        config.prior_radius_m or 0.0,
+        LOGITS_PER_METRE,
+        SOFTPLUS_SHARPNESS,
+        count,
+    )
+    out = points.new_empty(len(points))
+    code = native_library().snarf_evaluate(
+        byref(native),
+        c_void_p(points.data_ptr()),
+        c_void_p(None if extras is None else extras.data_ptr()),
+        c_int64(len(points)),
+        c_int32(torch.get_num_threads()),
+        c_void_p(out.data_ptr()),
+    )
+    if code == 2:
+        raise MemoryError("evaluating the shape ran out of memory; give fewer points at once")
+    if code:
+        raise RuntimeError(f"the native library refused the network (code {code})")
+    return out
+
+
+def _layer_tensors(network: OccupancyNetwork, condition: Tensor, parts: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield weight and bias of each layer in one pose [C]: columns for the layer before, the encoded point, the parts seen.
+
+    The pose code becomes a part of the bias, or, where points see `parts` of the condition, that many columns, since it is
+    linear in what they see.
+    """
+    config = network.config
+    for index, layer in enumerate(network.layers):
+        weight, bias = layer.weight, layer.bias
+        columns = []
+        if network.conditioned and index == config.condition_layer:
+            weight, code = weight.tensor_split([weight.shape[1] - config.condition_size], dim=1)
+            if parts:
+                mapping = network.pose_code.weight.unflatten(1, (parts, -1))  # [K, P, C / P]
+                columns = [code @ torch.einsum("pc,kpc->kp", condition.view(parts, -1), mapping)]
+                bias = bias + code @ network.pose_code.bias
+            else:
+                bias = bias + code @ network.pose_code(condition)
+        if index > 0 and index in config.skip_layers:
+            weight = weight / math.sqrt(2)
+        yield torch.cat([weight, *columns], 1).contiguous(), bias.contiguous()

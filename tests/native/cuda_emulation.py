@@ -1,0 +1,66 @@
+"""Runs the launches of snarfcli.native.cuda on the CPU: the kernels of csrc/cuda, compiled as C++ (emulation/cuda_shim.h)."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from snarfcli.native.cuda_compile import cuda_sources
+
+__all__ = ["EmulatedGpu", "build_emulation", "host_compiler"]
+
+_FOLDER = Path(__file__).parent / "emulation"
+_NUMBERS = {torch.float32: "float", torch.float64: "double"}
+
+
+class EmulatedGpu:
+    """A launcher whose blocks have up to `block` threads, each a thread of the operating system; 1 is fastest."""
+
+    def __init__(self, dtype: torch.dtype, block: int = 1) -> None:
+        self.library = build_emulation(dtype)
+        self.block = block
+        self.launches: list[str] = []
+
+    def threads(self, most: int) -> int:
+        return min(most, self.block)
+
+    def launch(self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: ctypes.Structure) -> None:
+        self.launches.append(kernel)
+        assert (cuda_sources() / "cuda" / f"{source}.cu").read_text().count(f" {kernel}(") == 1
+        assert min(blocks) > 0 and self.library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
+
+
+def host_compiler() -> str | None:
+    """Return a C++ compiler with GCC's command line, or None."""
+    chosen = os.environ.get("CXX")
+    return next((path for name in (chosen, "g++", "clang++", "c++") if name and (path := shutil.which(name))), None)
+
+
+@cache
+def build_emulation(dtype: torch.dtype) -> ctypes.CDLL:
+    """Compile all kernels for one type of numbers and load them.
+
+    SNARF_EMULATION_FLAGS adds flags to the compiler. Races show with
+    LD_PRELOAD=$(g++ -print-file-name=libtsan.so) SNARF_EMULATION_FLAGS=-fsanitize=thread.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "kernels.so"
+        command = [host_compiler(), "-std=c++17", "-O2", "-g", "-shared", "-fPIC", "-pthread"]
+        command += ["-Wall", "-Wextra", "-Werror", "-Wno-psabi", f"-DSNARF_NUMBER={_NUMBERS[dtype]}"]
+        command += [f"-I{cuda_sources() / 'include'}", f"-I{cuda_sources() / 'cuda'}"]
+        command += os.environ.get("SNARF_EMULATION_FLAGS", "").split()
+        command += ["-o", str(library), str(_FOLDER / "emulation.cpp")]
+        built = subprocess.run(command, capture_output=True, text=True)
+        if built.returncode:
+            raise RuntimeError(f"{' '.join(command)}\n{built.stderr}")
+        loaded = ctypes.CDLL(str(library), mode=ctypes.RTLD_LOCAL)
+    loaded.emulate.restype = ctypes.c_bool
+    loaded.search_bytes.restype = loaded.backward_bytes.restype = ctypes.c_size_t
+    return loaded

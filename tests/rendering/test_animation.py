@@ -1,0 +1,90 @@
+"""Frames on several processes: the same as on one, in order, and a clear end when a process is lost."""
+
+from __future__ import annotations
+
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moody_avatar import MoodyAvatar
+
+from snarfcli.errors import UserError
+from snarfcli.rendering.animation import Animation
+from snarfcli.rendering.drawers import Drawer
+from snarfcli.rendering.panels import Screen
+from snarfcli.rendering.processes import choose_processes, parse_processes
+from snarfcli.rendering.stage import body_points, set_stage
+from snarfcli.rendering.views import parse_views
+
+BENDS = [0.0, 0.3, 0.5, 0.7, 0.9, 1.2]
+
+
+def animation(folder: Path) -> Animation:
+    avatar = MoodyAvatar()
+    poses, translation = np.zeros((len(BENDS), 2, 3)), np.zeros((len(BENDS), 3))
+    poses[:, 1, 2] = BENDS
+    stage = set_stage(body_points(avatar, poses, translation), poses, parse_views(["front", "top"]))
+    return Animation(
+        avatar, "bend", poses, translation, list(range(10, 16)), surface="field", resolution=24, folder=folder, suffix="ply",
+        screen=Screen(stage, (48, 40), {"avatar": "avatar"}),
+    )  # fmt: skip
+
+
+def test_several_processes_make_the_same_frames_and_a_lost_one_is_reported(tmp_path):
+    alone, together = animation(tmp_path / "alone"), animation(tmp_path / "together")
+    pictures = alone.pictures()
+    wanted = [next(pictures) for _ in range(5)]
+    made = together.pictures(processes=2)
+    for picture in wanted:
+        np.testing.assert_array_equal(next(made), picture)
+    assert [(frame.frame, frame.file, frame.vertices) for frame in together.frames] == [
+        (frame.frame, frame.file, frame.vertices) for frame in alone.frames
+    ]
+    assert [frame.problem is not None for frame in together.frames] == [False, False, True, False, False]
+    with pytest.raises(UserError, match=r"ended early \(exit code 9\); .*fewer workers, for example processes=1") as caught:
+        next(made)
+    assert "\n" not in str(caught.value)
+    assert not multiprocessing.active_children()
+    names = [f"frame_{index:06d}.ply" for index in (0, 1, 3, 4)]
+    assert sorted(path.name for path in (tmp_path / "together").iterdir()) == names
+    for name in names:
+        assert (tmp_path / "together" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+
+
+def test_surfaces_made_here_are_drawn_elsewhere(tmp_path):
+    alone, together = animation(tmp_path / "alone"), animation(tmp_path / "together")
+    pictures, made = alone.pictures(), together.pictures(processes=2, extracts_here=True)
+    for _ in range(3):  # the third has no surface
+        np.testing.assert_array_equal(next(made), next(pictures))
+    assert [frame.vertices for frame in together.frames] == [frame.vertices for frame in alone.frames]
+    assert all(frame.rendering_s > 0 for frame in together.frames)
+    made.close()
+    assert not multiprocessing.active_children()
+
+
+def test_a_drawer_that_is_lost_or_fails_is_reported(tmp_path):
+    screen = animation(tmp_path).screen
+    drawer = Drawer(screen)
+    drawer.begin(0, {})
+    with pytest.raises(RuntimeError, match="KeyError: 'avatar'"):
+        drawer.take()
+    drawer.begin(0, {"avatar": None})
+    picture, seconds = drawer.take()
+    np.testing.assert_array_equal(picture, screen.draw(0, {"avatar": None}))
+    drawer._process.kill()
+    with pytest.raises(UserError, match=r"a process that draws ended early \(exit code -9\)"):
+        drawer.take()
+    drawer.end()
+
+
+def test_what_processes_may_be():
+    assert parse_processes("auto") is None and parse_processes("3") == 3
+    for text in ("0", "-1", "many", "65", "1.5"):
+        with pytest.raises(UserError, match="processes must be auto or a number from 1 to 64"):
+            parse_processes(text)
+    assert choose_processes(4, 100, 128) == 4 and choose_processes(4, 3, 128) == 3
+    assert choose_processes(None, 2, 128) == 1  # not worth a second process
+    assert choose_processes(None, 1000, 100_000) == 1  # no memory for it
+    assert choose_processes(4, 100, 128, extract=False) == 4
+    assert choose_processes(4, 100, 128, extract=False, draw=False) == 1

@@ -1,6 +1,6 @@
 """Milliseconds for the posed field at 200,000 points of one frame, search and shape separately, for each search.
 
-    python benchmarks/bm_evaluation.py          needs `make demo`, or give --avatar and --data-root
+python benchmarks/bm_evaluation.py          needs `make demo`, or give --avatar and --data-root
 """
 
 from __future__ import annotations

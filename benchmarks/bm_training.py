@@ -1,6 +1,6 @@
 """Seconds of one training step and its parts, for each preset.
 
-    python benchmarks/bm_training.py            needs the samples of `snarf preprocess subject=50002`
+python benchmarks/bm_training.py            needs the samples of `snarf preprocess subject=50002`
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Seconds to draw one frame of a video, and frames a second of a whole one on one process and on several.
 
-    python benchmarks/bm_video.py               needs `make demo`, or give --avatar
+python benchmarks/bm_video.py               needs `make demo`, or give --avatar
 """
 
 from __future__ import annotations

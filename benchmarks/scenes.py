@@ -23,7 +23,9 @@ from snarfcli.sampling import sampling_cube, winding_numbers
 from snarfcli.segments import segment_distances
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "deformer"))
-from ground_truth import blended_nodes, field, locate_cells  # noqa: E402
+import itertools
+
+from ground_truth import blended_nodes, field, locate_cells
 
 __all__ = ["NINE_BONES", "QUERY_KINDS", "Scene", "body_scene", "field_scene", "scenes"]
 
@@ -159,7 +161,7 @@ def _untrained(nodes: Tensor, bones: int, sharpness: float) -> Tensor:
     """Return the softmax [N, J] of a freshly initialised network of the papers' size at nodes [N, 3] in [-1, 1]."""
     generator = torch.Generator().manual_seed(0)
     h, sizes = nodes, [3, 128, 128, 128, 128, bones]
-    for i, (wide, narrow) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for i, (wide, narrow) in enumerate(itertools.pairwise(sizes)):
         weight, bias = (torch.rand(narrow, k, generator=generator) * 2 - 1 for k in (wide, 1))
         h = h @ (weight / wide**0.5).T + bias[:, 0] / wide**0.5  # PyTorch's default for linear layers
         h = torch.nn.functional.softplus(h, beta=100) if i < 4 else h

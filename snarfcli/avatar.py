@@ -27,9 +27,7 @@ class Avatar(TrainedField):
         """Return the canonical mesh that `mesh(surface="skinned")` poses, computed once; see `meshing.skinned_surface`."""
         return skinned_surface(self, resolution, keep_share)
 
-    def mesh(
-        self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field"
-    ) -> Mesh:
+    def mesh(self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field") -> Mesh:
         """Return the posed mesh of one pose.
 
         Args:

@@ -40,7 +40,7 @@ def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str |
         path = Path(ckpt)
         path = path / "avatar.pt" if path.is_dir() else path
         if not path.is_file():
-            raise UserError(f"no avatar at {ckpt} (ckpt); give the avatar.pt that \"snarf train\" wrote")
+            raise UserError(f'no avatar at {ckpt} (ckpt); give the avatar.pt that "snarf train" wrote')
         return path
     folder = run_folder(output_root, data, subject, run)
     if not (folder / "avatar.pt").is_file():

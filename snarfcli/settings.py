@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import itertools
 import re
 import textwrap
 import typing
@@ -70,7 +71,7 @@ def describe(schema: type) -> Iterator[tuple[str, str]]:
     texts: dict[str, str] = {}
     for owner in reversed([kind for kind in schema.__mro__ if dataclasses.is_dataclass(kind)]):
         body = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body  # type: ignore[attr-defined]
-        for field, below in zip(body, body[1:], strict=False):
+        for field, below in itertools.pairwise(body):
             is_text = (
                 isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) and isinstance(below.value.value, str)
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 
 import pytest
 import yaml
@@ -37,20 +38,23 @@ def test_cape_changes_what_the_preset_of_training_says_whatever_comes_first(caps
     choices = ["experiment=cape", f"training={training}"]
     config = composed(capsys, "train", *(choices if is_first else choices[::-1]))
     without = composed(capsys, "train", f"training={training}")
-    assert config.pop("experiment") == "cape" and without.pop("experiment") is None
+    assert config.pop("experiment") == "cape"
+    assert without.pop("experiment") is None
     frequencies, others = config["shape"].pop("frequencies"), without["shape"].pop("frequencies")
     assert frequencies != others
     assert (config["condition"].pop("layer"), without["condition"].pop("layer")) == (0, None if training == "paper" else 2)
     assert config == without  # width, depth, losses and steps are the preset's, the data the user's
-    ratios = [b / a for a, b in zip(frequencies[:-1], frequencies[1:], strict=True)]
-    assert len(ratios) > 2 and ratios == pytest.approx([2.0] * len(ratios), rel=1e-3)
+    ratios = [b / a for a, b in itertools.pairwise(frequencies)]
+    assert len(ratios) > 2
+    assert ratios == pytest.approx([2.0] * len(ratios), rel=1e-3)
 
 
 def test_single_settings_and_other_choices_win(capsys):
     config = composed(capsys, "train", "experiment=cape", "condition.layer=3", "data=clothed", "condition=local")
     assert (config["condition"]["layer"], config["data"]["name"], config["condition"]["name"]) == (3, "clothed", "local")
     config = composed(capsys, "train", "experiment=smoke", "training=standard", "data_root=mine")
-    assert config["training"]["name"] == "standard" and config["data_root"] == "mine"
+    assert config["training"]["name"] == "standard"
+    assert config["data_root"] == "mine"
 
 
 def test_smoke_is_one_small_folder_for_every_command(capsys):
@@ -59,7 +63,8 @@ def test_smoke_is_one_small_folder_for_every_command(capsys):
     (root,) = {config["data_root"] for config in configs.values()}
     assert root != composed(capsys, "train")["data_root"]  # full samples stay as they are
     assert len({config["output_root"] for name, config in configs.items() if name != "preprocess"}) == 1
-    assert configs["train"]["training"]["name"] == "smoke" and configs["train"]["shape"]["width"] == 128
+    assert configs["train"]["training"]["name"] == "smoke"
+    assert configs["train"]["shape"]["width"] == 128
     # 240 frames a training sequence: some must be left for training beside those for validation.
     assert 2 <= 240 / configs["preprocess"]["data"]["frame_step"] <= 10
 
@@ -89,7 +94,8 @@ WRONG = {
 def test_unknown_ones_are_refused_in_one_line(capsys, arguments):
     assert cli.main(list(arguments)) == 2
     err = capsys.readouterr().err
-    assert WRONG[arguments] in err and len(err.strip().splitlines()) == 1
+    assert WRONG[arguments] in err
+    assert len(err.strip().splitlines()) == 1
 
 
 def test_several_in_one_call(capsys):

@@ -32,9 +32,10 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
 def test_what_is_no_json_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "split.json"
     path.write_bytes(text.encode("latin1"))
-    with pytest.raises(UserError, match="^split .*split.json ") as caught:
+    with pytest.raises(UserError, match=r"^split .*split.json ") as caught:
         read_json(path, "split")
-    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400
     for other, message in ((tmp_path, "is a folder"), (tmp_path / "none", "no split at")):
         with pytest.raises(UserError, match=message):
             read_json(other, "split")
@@ -135,7 +136,8 @@ def test_archives_that_are_strange_end_in_one_line(tmp_path: Path) -> None:
     for name, message in wrong.items():
         with pytest.raises(UserError, match=message) as caught:
             read_npz(tmp_path / f"{name}.npz", "body")
-        assert "\n" not in str(caught.value) and name in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert name in str(caught.value)
     large = packed(tmp_path / "large.npz", ("x.npy", npy(np.random.default_rng(0).normal(size=2000))))
     with pytest.raises(UserError, match="unpacks to 0 MiB, more than 0; cut it into parts"):
         read_npz(large, max_bytes=16000)
@@ -145,7 +147,8 @@ def test_what_is_not_asked_for_may_hold_anything(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", x=np.arange(3), y=np.array([{}], dtype=object))
     assert list(read_npz(tmp_path / "a.npz", only=("x", "z"))) == ["x"]
     packed(tmp_path / "b.npz", ("folder/", b""), ("../x.npy", npy(np.arange(3))))
-    assert read_npz(tmp_path / "b.npz")["../x"].tolist() == [0, 1, 2] and not (tmp_path.parent / "x.npy").exists()
+    assert read_npz(tmp_path / "b.npz")["../x"].tolist() == [0, 1, 2]
+    assert not (tmp_path.parent / "x.npy").exists()
 
 
 @pytest.mark.parametrize(
@@ -161,10 +164,14 @@ def test_arrays_come_back_as_they_were(array: np.ndarray, tmp_path: Path) -> Non
     for save in (np.savez, np.savez_compressed):
         save(tmp_path / "a.npz", x=array)
         back = read_npz(tmp_path / "a.npz")["x"]
-        assert back.dtype == array.dtype and back.shape == array.shape and back.tobytes() == array.tobytes()
+        assert back.dtype == array.dtype
+        assert back.shape == array.shape
+        assert back.tobytes() == array.tobytes()
     np.save(tmp_path / "a.npy", array)
     back = read_npy(tmp_path / "a.npy")
-    assert back.dtype == array.dtype and back.shape == array.shape and back.tobytes() == array.tobytes()
+    assert back.dtype == array.dtype
+    assert back.shape == array.shape
+    assert back.tobytes() == array.tobytes()
     assert back.flags.writeable
 
 
@@ -183,7 +190,8 @@ def test_npy_files_that_are_none_end_in_one_line(tmp_path: Path) -> None:
     for name, message in wrong.items():
         with pytest.raises(UserError, match=message) as caught:
             read_npy(tmp_path / f"{name}.npy", "pose file")
-        assert "\n" not in str(caught.value) and name in str(caught.value)
+        assert "\n" not in str(caught.value)
+        assert name in str(caught.value)
     with pytest.raises(UserError, match="has 0 MiB, more than 0"):
         read_npy(tmp_path / "longer.npy", max_bytes=8)
     with pytest.raises(UserError, match="is a folder"):

@@ -108,7 +108,7 @@ def test_endless_reader_is_stopped(tmp_path, monkeypatch):
             with contextlib.suppress(Exception):  # a reader that swallows every error does not swallow this one
                 time.sleep(0.01)
 
-    with pytest.raises(AssertionError, match="took over 0.2 s"):
+    with pytest.raises(AssertionError, match=r"took over 0.2 s"):
         check_target(_toy(read), 50, 0, tmp_path)
 
 

@@ -23,7 +23,20 @@ LAYERS = (
     ("datasets", "meshing"),
     ("models", "motions"),
     ("bodies", "deformer", "shape"),
-    ("checks", "files", "formats", "native", "names", "parallel", "precision", "progress", "runs", "sampling", "segments", "settings"),
+    (
+        "checks",
+        "files",
+        "formats",
+        "native",
+        "names",
+        "parallel",
+        "precision",
+        "progress",
+        "runs",
+        "sampling",
+        "segments",
+        "settings",
+    ),
     ("errors",),
 )
 """Folders and top-level modules of the package, from the top; those of one layer do not know each other."""

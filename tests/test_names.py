@@ -14,5 +14,6 @@ def test_a_number_does_not_make_a_name_too_long():
 
 
 def test_one_name_for_one_folder():
-    assert folder_name("../a b") == "a_b" and folder_name("a" * 79 + ".b") == "a" * 79
+    assert folder_name("../a b") == "a_b"
+    assert folder_name("a" * 79 + ".b") == "a" * 79
     assert folder_name("..", "motion") == "motion"

@@ -51,9 +51,7 @@ def run_from(site: Path, code: str) -> subprocess.CompletedProcess[str]:
     paths = [str(site), *(path for path in sys.path if path and Path(path) != ROOT and not Path(path).is_relative_to(tests))]
     begin = f"import sys; sys.path[1:1] = {paths!r}; import snarfcli; assert {str(site)!r} in snarfcli.__file__; "
     environment = {key: value for key, value in os.environ.items() if key != "SNARF_NATIVE_LIBRARY"}
-    return subprocess.run(
-        [sys.executable, "-S", "-c", begin + code], cwd=site, env=environment, capture_output=True, text=True
-    )
+    return subprocess.run([sys.executable, "-S", "-c", begin + code], cwd=site, env=environment, capture_output=True, text=True)
 
 
 def test_the_wheel_holds_what_is_needed_at_run_time(wheel, tmp_path):
@@ -63,7 +61,8 @@ def test_the_wheel_holds_what_is_needed_at_run_time(wheel, tmp_path):
     kernels = [path for folder in ("include/snarf", "cuda") for path in (ROOT / "csrc" / folder).iterdir()]
     sources = {f"snarfcli/{path.relative_to(ROOT).as_posix()}" for path in kernels}
     modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "snarfcli").rglob("*.py")}
-    assert configuration and sources
+    assert configuration
+    assert sources
     assert configuration | sources | modules | {"snarfcli/bodies/body_cc0.npz"} <= names
     assert [name for name in names if "libsnarf_native" in name] == [_native_name()]
     assert all(name.startswith(("snarfcli/", "snarf-")) for name in names)
@@ -120,7 +119,8 @@ def test_a_source_that_does_not_compile_leaves_the_library_out(tmp_path):
     unpack(wheel, tmp_path / "site")
     done = run_from(tmp_path / "site", "from snarfcli.native.library import choose_backend; choose_backend('auto')")
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("Warning") == 1 and "reinstall snarf with a C++ compiler" in done.stderr
+    assert done.stderr.count("Warning") == 1
+    assert "reinstall snarf with a C++ compiler" in done.stderr
 
 
 def test_the_source_distribution_builds(tmp_path):

@@ -14,10 +14,14 @@ from snarfcli.formats.surfaces import list_surfaces, read_surface
 def test_animal_is_one_closed_surface(spacing, vertices):
     animal = make_animal(spacing)
     mesh = trimesh.Trimesh(animal.vertices, animal.faces, process=False)
-    assert mesh.is_watertight and mesh.volume > 0 and mesh.body_count == 1
-    assert vertices[0] < len(animal.vertices) < vertices[1] and len(animal.names) == 19
+    assert mesh.is_watertight
+    assert mesh.volume > 0
+    assert mesh.body_count == 1
+    assert vertices[0] < len(animal.vertices) < vertices[1]
+    assert len(animal.names) == 19
     np.testing.assert_allclose(animal.weights.sum(1), 1, atol=1e-12)
-    assert ((animal.weights > 0).sum(1) <= 4).all() and animal.vertices[:, 1].min() == pytest.approx(0, abs=0.03)
+    assert ((animal.weights > 0).sum(1) <= 4).all()
+    assert animal.vertices[:, 1].min() == pytest.approx(0, abs=0.03)
 
 
 def test_clips_show_different_poses():

@@ -20,9 +20,7 @@ _SIDED_MIXAMO = _SIDED_CMU | {"hand": "HandMiddle1"}
 
 def _named(middle: dict[str, str], sided: dict[str, str], prefix: str = "") -> tuple[str, ...]:
     full = {"l": "Left", "r": "Right"}
-    return tuple(
-        prefix + (middle[name] if name in middle else full[name[0]] + sided[name[2:]]) for name in SMPL_JOINT_NAMES
-    )
+    return tuple(prefix + (middle[name] if name in middle else full[name[0]] + sided[name[2:]]) for name in SMPL_JOINT_NAMES)
 
 
 CMU_NAMES = _named(

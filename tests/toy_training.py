@@ -20,9 +20,7 @@ from snarfcli.training.settings import TrainingConfig
 
 def toy_store(root: Path, points: int = 800, frames: int = 34) -> SampleStore:
     """Make and open the samples of the toy subject under `root`."""
-    sampling = SamplingSettings(
-        points_per_frame=points, surface_noise_m=0.01, padding=0.1, inside_test="winding", seed=0
-    )
+    sampling = SamplingSettings(points_per_frame=points, surface_noise_m=0.01, padding=0.1, inside_test="winding", seed=0)
     preprocess_subject(toy_subject(train_frames=frames), root, sampling, {"train": 1, "test": 1, "ood": 1})
     return SampleStore.open(root, "builtin", "toy")
 

@@ -1,6 +1,6 @@
 """Draw ground truth above prediction for frames in and out of distribution: the picture of the README.
 
-    python tools/contact_sheet.py outputs/builtin/50002/demo/avatar.pt docs/contact_sheet.png
+python tools/contact_sheet.py outputs/builtin/50002/demo/avatar.pt docs/contact_sheet.png
 """
 
 from __future__ import annotations
@@ -33,9 +33,7 @@ def main() -> None:
         for name, at in frames:
             sequence = next(s for s in store.sequences("test" if split == "id" else "ood") if s.name == name)
             index = int(at * sequence.num_frames)
-            pictures, _ = draw_frame(
-                avatar, sequence, index, resolution=options.resolution, size=options.size
-            )
+            pictures, _ = draw_frame(avatar, sequence, index, resolution=options.resolution, size=options.size)
             truths.append(pictures[0])
             predictions.append(pictures[1])
             labels.append(f"{'in' if split == 'id' else 'out of'} distribution: {name}")

@@ -19,8 +19,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from fuzz_targets import TARGETS  # noqa: E402
-from fuzzing import find_failures, scratch_folder  # noqa: E402
+from fuzz_targets import TARGETS
+from fuzzing import find_failures, scratch_folder
 
 _MAX_FAILURES = 20
 # Address space above what the reader's modules take: far over the 1 GiB that a file may cost, since not all of it is used.

@@ -274,7 +274,7 @@ def build(vertices=6890, samples=400, seed=0, log=print):
     # shape space
     x = verts[1:].reshape(samples, -1)
     mean = x.mean(0)
-    uu, ss, vt = np.linalg.svd(x - mean, full_matrices=False)
+    _uu, ss, vt = np.linalg.svd(x - mean, full_matrices=False)
     std = ss / np.sqrt(samples - 1)
     log(
         "PCA std (m, rms over vertices)",
@@ -296,16 +296,16 @@ def build(vertices=6890, samples=400, seed=0, log=print):
     jt = jreg @ v_template
     posedirs = corrective_basis(v_template, w, jt, rng)
     log("posedirs nonzero", float((posedirs != 0).mean()), "max", float(np.abs(posedirs).max()))
-    return dict(
-        v_template=v_template.astype(np.float32),
-        f=g.astype(np.int32),
-        weights=w.astype(np.float32),
-        J_regressor=jreg.astype(np.float32),
-        kintree_table=np.stack([PARENTS, np.arange(24)]).astype(np.int32),
-        shapedirs=shapedirs.astype(np.float32),
-        posedirs=posedirs.astype(np.float32),
-        J_template=jt.astype(np.float32),
-    )
+    return {
+        "v_template": v_template.astype(np.float32),
+        "f": g.astype(np.int32),
+        "weights": w.astype(np.float32),
+        "J_regressor": jreg.astype(np.float32),
+        "kintree_table": np.stack([PARENTS, np.arange(24)]).astype(np.int32),
+        "shapedirs": shapedirs.astype(np.float32),
+        "posedirs": posedirs.astype(np.float32),
+        "J_template": jt.astype(np.float32),
+    }
 
 
 def barycentric(p, tri):

@@ -28,15 +28,15 @@ def sample_people(samples, seed):
     def beta(a, b, lo, hi):
         return lo + (hi - lo) * rng.beta(a, b, samples)
 
-    ph = dict(
-        gender=beta(0.6, 0.6, 0, 1),
-        age=beta(1.5, 2.0, 0.62, 0.92),
-        muscle=beta(2, 2, 0.15, 0.95),
-        weight=beta(2, 2, 0.10, 0.95),
-        height=beta(4, 4, 0.06, 0.62),
-        proportions=beta(2, 2, 0.2, 1.0),
-    )
-    mean = dict(gender=0.5, age=0.68, muscle=0.55, weight=0.5, height=0.35, proportions=0.6)
+    ph = {
+        "gender": beta(0.6, 0.6, 0, 1),
+        "age": beta(1.5, 2.0, 0.62, 0.92),
+        "muscle": beta(2, 2, 0.15, 0.95),
+        "weight": beta(2, 2, 0.10, 0.95),
+        "height": beta(4, 4, 0.06, 0.62),
+        "proportions": beta(2, 2, 0.2, 1.0),
+    }
+    mean = {"gender": 0.5, "age": 0.68, "muscle": 0.55, "weight": 0.5, "height": 0.35, "proportions": 0.6}
     x = np.stack([np.concatenate([[mean[k]], ph[k]]) for k in labels], 1)
     x = torch.as_tensor(x, dtype=model.dtype)
     verts, heads = [], []
@@ -51,16 +51,16 @@ def sample_people(samples, seed):
     np.add.at(w, (np.arange(len(w))[:, None].repeat(idx.shape[1], 1), idx), val)
     parents = np.asarray(model.bone_parents)
     quads = model.faces.numpy()
-    return dict(
-        v=to_y_up(np.concatenate(verts)),
-        heads=to_y_up(np.concatenate(heads)),
-        w=w,
-        parents=parents,
-        labels=list(model.bone_labels),
-        quads=quads,
-        phen=x.numpy(),
-        phen_labels=labels,
-    )
+    return {
+        "v": to_y_up(np.concatenate(verts)),
+        "heads": to_y_up(np.concatenate(heads)),
+        "w": w,
+        "parents": parents,
+        "labels": list(model.bone_labels),
+        "quads": quads,
+        "phen": x.numpy(),
+        "phen_labels": labels,
+    }
 
 
 def shortest_arc(a, b):

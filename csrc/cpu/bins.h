@@ -1,4 +1,5 @@
-// Which bins of the sorted queries a place or a box touches: the library that marks bins and the kernels that read them must agree.
+// Which bins of the sorted queries a place or a box touches: the library that marks bins and the kernels that read them must
+// agree.
 #pragma once
 
 #include "kernels.h"
@@ -8,7 +9,8 @@ namespace snarf {
 namespace SNARF_ISA {
 
 // Grows with the position, so that a query inside a box never lies outside the box's bins.
-template <class S> SNARF_HD int32_t bin_along(const SortedQueries<S>& queries, int axis, S position) {
+template <class S>
+SNARF_HD int32_t bin_along(const SortedQueries<S>& queries, int axis, S position) {
   const S at = (position - queries.lower[axis]) * queries.per_metre;
   return at > 0 ? (at < S(queries.bins[axis]) ? int32_t(at) : queries.bins[axis] - 1) : 0;
 }

@@ -24,7 +24,8 @@ inline std::vector<uint8_t> used_nodes(const snarf_blending& blending) {
     for (int64_t y = 0; y + 1 < height; ++y)
       for (int64_t x = 0; x + 1 < width; ++x) {
         if (!*active++) continue;
-        for (int64_t row : {(z * height + y) * width, (z * height + y + 1) * width, ((z + 1) * height + y) * width, ((z + 1) * height + y + 1) * width})
+        for (int64_t row : {(z * height + y) * width, (z * height + y + 1) * width, ((z + 1) * height + y) * width,
+                            ((z + 1) * height + y + 1) * width})
           used[row + x] = used[row + x + 1] = 1;
       }
   return used;
@@ -32,7 +33,8 @@ inline std::vector<uint8_t> used_nodes(const snarf_blending& blending) {
 
 constexpr int64_t kNodeChunks = 64;  // fixed, so that sums over the nodes do not depend on the number of threads
 
-template <class S> class Blending {
+template <class S>
+class Blending {
  public:
   explicit Blending(const snarf_blending& blending) : used_(used_nodes(blending)) {
     task_.weights = static_cast<const S*>(blending.weights);
@@ -47,7 +49,8 @@ template <class S> class Blending {
 
   void forward(S* transforms) {
     std::vector<S> rows(size_t(task_.poses * task_.bones * kRow), S(0));
-    for (int64_t n = 0; n < task_.poses * task_.bones; ++n) std::copy(bones_ + 12 * n, bones_ + 12 * n + 12, &rows[size_t(n * kRow)]);
+    for (int64_t n = 0; n < task_.poses * task_.bones; ++n)
+      std::copy(bones_ + 12 * n, bones_ + 12 * n + 12, &rows[size_t(n * kRow)]);
     task_.rows = rows.data();
     each_chunk([&](const BlendTask<S>& task, int64_t) { kernels<S>().blend(task, transforms); });
   }
@@ -81,16 +84,17 @@ template <class S> class Blending {
   }
 
  private:
-  template <class F> void each_chunk(const F& work) {
+  template <class F>
+  void each_chunk(const F& work) {
     Queue queue(kNodeChunks, 1);
     const bool well = run_phases(threads_, {[&](int) {
-      for (int64_t chunk, end; queue.take(chunk, end);) {
-        BlendTask<S> task = task_;
-        task.first = task.nodes * chunk / kNodeChunks;
-        task.last = task.nodes * (chunk + 1) / kNodeChunks;
-        if (task.first < task.last) work(task, chunk);
-      }
-    }});
+                                   for (int64_t chunk, end; queue.take(chunk, end);) {
+                                     BlendTask<S> task = task_;
+                                     task.first = task.nodes * chunk / kNodeChunks;
+                                     task.last = task.nodes * (chunk + 1) / kNodeChunks;
+                                     if (task.first < task.last) work(task, chunk);
+                                   }
+                                 }});
     if (!well) throw std::bad_alloc();
   }
 

@@ -6,9 +6,9 @@
 //   count    queries in each marked bin, chunk by chunk
 //   place    counting sort of the queries into the bins
 //   search   blocks of cells, handed out one by one; every thread keeps its own list of roots
-// and through those of `Collect`, which sorts the roots by query, and within a query by cell, and drops duplicates on the common
-// face of two cells. Which thread found a root leaves no trace in the result, and a query's roots do not depend on the other
-// queries of the batch.
+// and through those of `Collect`, which sorts the roots by query, and within a query by cell, and drops duplicates on the
+// common face of two cells. Which thread found a root leaves no trace in the result, and a query's roots do not depend on the
+// other queries of the batch.
 #pragma once
 
 #include <algorithm>
@@ -28,10 +28,11 @@ namespace snarf {
 
 constexpr int64_t kGroupQueries = int64_t(1) << 20;  // queries searched together: bounds the memory of the sort
 constexpr int64_t kGroupBlocks = int64_t(1) << 17;   // blocks of cells of all poses searched together: 50 MB of boxes
-constexpr int64_t kMostChunks = 8;                    // parts of a pose's queries that are sorted at once; each has a histogram
-constexpr double kBinPerBox = 0.6;                  // side of a bin, in mean sides of the posed boxes
+constexpr int64_t kMostChunks = 8;                   // parts of a pose's queries that are sorted at once; each has a histogram
+constexpr double kBinPerBox = 0.6;                   // side of a bin, in mean sides of the posed boxes
 
-template <class S> class ScratchLists {
+template <class S>
+class ScratchLists {
  public:
   ScratchLists() : scratch_{{nullptr, nullptr, nullptr}, nullptr, 0, this, reserve} {}
   Scratch<S>& scratch() { return scratch_; }
@@ -55,7 +56,8 @@ template <class S> class ScratchLists {
   Scratch<S> scratch_;
 };
 
-template <class S> Geometry<S> geometry_of(const snarf_field& field) {
+template <class S>
+Geometry<S> geometry_of(const snarf_field& field) {
   Geometry<S> geometry;
   for (int i = 0; i < 3; ++i) {
     geometry.lower[i] = S(field.lower[i]);
@@ -81,12 +83,14 @@ inline std::vector<Block> active_blocks(const snarf_field& field, const uint8_t*
   return blocks;
 }
 
-template <class S> S smallest_side(const Geometry<S>& geometry) {
+template <class S>
+S smallest_side(const Geometry<S>& geometry) {
   return std::min(geometry.size[0], std::min(geometry.size[1], geometry.size[2]));
 }
 
 // A box, and how large the boxes in it are; one for each pose and thread, or part of its queries.
-template <class S> struct Extent {
+template <class S>
+struct Extent {
   S lower[3], upper[3];
   double sides = 0;
   int64_t boxes = 0;
@@ -105,16 +109,30 @@ template <class S> struct Extent {
 };
 
 // The complete search of a group: `poses` poses from `first_pose` on, and of each the queries from `first_query` on.
-template <class S> class CompleteSearch {
+template <class S>
+class CompleteSearch {
  public:
-  CompleteSearch(const snarf_field& field, const snarf_queries& queries, const snarf_complete& settings, const std::vector<Block>& blocks,
-                 int64_t first_pose, int64_t poses, int64_t first_query, int64_t count, int threads)
-      : kernels_(kernels<S>()), blocks_(blocks), poses_(poses), count_(count), threads_(threads),
-        chunks_(int(std::min<int64_t>((threads + poses - 1) / poses, kMostChunks))), geometry_(geometry_of<S>(field)), nodes_(node_count(field)),
-        points_(static_cast<const S*>(queries.points) + 3 * (first_pose * queries.count + first_query)), stride_(3 * queries.count),
-        transforms_(static_cast<const S*>(field.transforms) + 12 * nodes_ * first_pose), settings_(settings),
-        box_queue_(poses * int64_t(blocks.size()), 16), extent_queue_(poses * chunks_, 1), mark_queue_(poses * int64_t(blocks.size()), 16),
-        count_queue_(poses * chunks_, 1), scan_queue_(poses, 1), place_queue_(poses * chunks_, 1),
+  CompleteSearch(const snarf_field& field, const snarf_queries& queries, const snarf_complete& settings,
+                 const std::vector<Block>& blocks, int64_t first_pose, int64_t poses, int64_t first_query, int64_t count,
+                 int threads)
+      : kernels_(kernels<S>()),
+        blocks_(blocks),
+        poses_(poses),
+        count_(count),
+        threads_(threads),
+        chunks_(int(std::min<int64_t>((threads + poses - 1) / poses, kMostChunks))),
+        geometry_(geometry_of<S>(field)),
+        nodes_(node_count(field)),
+        points_(static_cast<const S*>(queries.points) + 3 * (first_pose * queries.count + first_query)),
+        stride_(3 * queries.count),
+        transforms_(static_cast<const S*>(field.transforms) + 12 * nodes_ * first_pose),
+        settings_(settings),
+        box_queue_(poses * int64_t(blocks.size()), 16),
+        extent_queue_(poses * chunks_, 1),
+        mark_queue_(poses * int64_t(blocks.size()), 16),
+        count_queue_(poses * chunks_, 1),
+        scan_queue_(poses, 1),
+        place_queue_(poses * chunks_, 1),
         search_queue_(poses * int64_t(blocks.size()), 4) {}
 
   // Adds its phases; the roots go to `group`.
@@ -165,7 +183,8 @@ template <class S> class CompleteSearch {
     for (int64_t part, end; extent_queue_.take(part, end);) {
       Extent<S> extent;
       const int64_t first = chunk_begin(part);
-      kernels_.extent(points_ + stride_ * (part / chunks_) + 3 * first, chunk_begin(part, 1) - first, extent.lower, extent.upper);
+      kernels_.extent(points_ + stride_ * (part / chunks_) + 3 * first, chunk_begin(part, 1) - first, extent.lower,
+                      extent.upper);
       query_extents_[part] = extent;
     }
   }
@@ -195,7 +214,8 @@ template <class S> class CompleteSearch {
         side = std::max(side, longest * 1e-3);
         for (;; side *= 1.25) {
           volume = 1;
-          for (int i = 0; i < 3; ++i) volume *= std::floor(double(sorted.upper[i] - sorted.lower[i]) / std::max(side, 1e-30)) + 1;
+          for (int i = 0; i < 3; ++i)
+            volume *= std::floor(double(sorted.upper[i] - sorted.lower[i]) / std::max(side, 1e-30)) + 1;
           if (volume <= double(count_ + 4096)) break;
         }
       }
@@ -246,8 +266,10 @@ template <class S> class CompleteSearch {
       for (int64_t n = first; n < last; ++n) {
         const int32_t at = key[n];
         if (at < 0) continue;
-        if (marked[at].load(std::memory_order_relaxed)) ++histogram[at];
-        else key[n] = -1;
+        if (marked[at].load(std::memory_order_relaxed))
+          ++histogram[at];
+        else
+          key[n] = -1;
       }
     }
   }
@@ -357,8 +379,7 @@ void complete_search(const snarf_field& field, const snarf_queries& queries, con
   if (blocks.empty() || !queries.poses || !queries.count) return;
   const S distance = S(kSameRoot) * smallest_side(geometry_of<S>(field));
   const int64_t at_once = std::min(queries.count, kGroupQueries);
-  const int64_t poses_at_once =
-      std::max<int64_t>(1, std::min(kGroupQueries / at_once, kGroupBlocks / int64_t(blocks.size())));
+  const int64_t poses_at_once = std::max<int64_t>(1, std::min(kGroupQueries / at_once, kGroupBlocks / int64_t(blocks.size())));
   for (int64_t pose = 0; pose < queries.poses; pose += poses_at_once)
     for (int64_t query = 0; query < queries.count; query += at_once) {
       const int64_t poses = std::min(poses_at_once, queries.poses - pose), count = std::min(at_once, queries.count - query);

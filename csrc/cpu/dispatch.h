@@ -16,10 +16,11 @@ inline InstructionSet best_instruction_set() {
 #if defined(SNARF_X86_KERNELS)
 #if defined(__GNUC__)
   __builtin_cpu_init();
-  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2"))
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
+      __builtin_cpu_supports("bmi2"))
     best = kAvx2;
-  if (best == kAvx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512bw") &&
-      __builtin_cpu_supports("avx512vl"))
+  if (best == kAvx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl"))
     best = kAvx512;
 #endif
 #endif
@@ -34,9 +35,10 @@ inline InstructionSet instruction_set() {
   return chosen;
 }
 
-template <class S> const Kernels<S>& kernels() {
+template <class S>
+const Kernels<S>& kernels() {
 #if defined(SNARF_X86_KERNELS)
-  static const Kernels<S> chosen = instruction_set() == kAvx512  ? avx512::kernels<S>()
+  static const Kernels<S> chosen = instruction_set() == kAvx512 ? avx512::kernels<S>()
                                    : instruction_set() == kAvx2 ? avx2::kernels<S>()
                                                                 : baseline::kernels<S>();
 #else

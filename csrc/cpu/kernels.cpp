@@ -19,20 +19,23 @@ namespace SNARF_ISA {
 namespace {
 
 // The polynomials of as many cells as there are lanes, laid out so that one cell's numbers can be picked out.
-template <class S> struct CellLanes {
+template <class S>
+struct CellLanes {
   Cell<Lanes<S>> cell;
   CellBounds<Lanes<S>> bounds;
 };
 
 // One cell or part of a cell, ready to be searched.
-template <class S> struct Part {
+template <class S>
+struct Part {
   S c[3 * kMonomials];
   S box[3], inverse[9], reach[3], curvature;
   S shift[3], scale;  // its centre and side within the cell, cell coordinates
   int level;
 };
 
-template <class S> struct Search {
+template <class S>
+struct Search {
   const CompleteTask<S>& task;
   Scratch<S>& scratch;
   RootSink<S>& sink;
@@ -41,7 +44,8 @@ template <class S> struct Search {
 };
 
 // The grid as the shared mathematics knows it, in this instruction set's namespace.
-template <class S> Grid<S> grid_of(const Geometry<S>& geometry) {
+template <class S>
+Grid<S> grid_of(const Geometry<S>& geometry) {
   Grid<S> grid;
   for (int i = 0; i < 3; ++i) {
     grid.lower[i] = geometry.lower[i];
@@ -52,7 +56,8 @@ template <class S> Grid<S> grid_of(const Geometry<S>& geometry) {
 }
 
 // Cells x .. x + width - 1 of a row, one a lane; beyond the end of the row the last node is repeated.
-template <class S> void load_cells(const S* transforms, const Geometry<S>& geometry, int x, int y, int z, Cell<Lanes<S>>& out) {
+template <class S>
+void load_cells(const S* transforms, const Geometry<S>& geometry, int x, int y, int z, Cell<Lanes<S>>& out) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   const int64_t row_nodes = geometry.nodes[0];
@@ -75,14 +80,16 @@ template <class S> void load_cells(const S* transforms, const Geometry<S>& geome
 }
 
 // Numbers that repeat with the period of x, y, z over three packs of lanes, as `points` [N, 3] do.
-template <class S> void spread(const S* xyz, Lanes<S>* out) {
+template <class S>
+void spread(const S* xyz, Lanes<S>* out) {
   constexpr int width = Lanes<S>::width;
   S values[3 * width];
   for (int k = 0; k < 3 * width; ++k) values[k] = xyz[k % 3];
   for (int i = 0; i < 3; ++i) out[i] = load<S>(values + i * width);
 }
 
-template <class S> void extent(const S* points, int64_t count, S* lower, S* upper) {
+template <class S>
+void extent(const S* points, int64_t count, S* lower, S* upper) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   V low[3], high[3];
@@ -104,7 +111,8 @@ template <class S> void extent(const S* points, int64_t count, S* lower, S* uppe
     for (int i = 0; i < 3; ++i) widen(i, points[3 * n + i], points[3 * n + i]);
 }
 
-template <class S> void bins(const SortedQueries<S>& queries, const S* points, int64_t count, int32_t* bin) {
+template <class S>
+void bins(const SortedQueries<S>& queries, const S* points, int64_t count, int32_t* bin) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   const S per_metre[3] = {queries.per_metre, queries.per_metre, queries.per_metre};
@@ -139,7 +147,8 @@ template <class S> void bins(const SortedQueries<S>& queries, const S* points, i
   }
 }
 
-template <class S> void boxes(const S* transforms, const Geometry<S>& geometry, const Block& block, BlockBoxes<S>& out) {
+template <class S>
+void boxes(const S* transforms, const Geometry<S>& geometry, const Block& block, BlockBoxes<S>& out) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   for (int first = 0; first < kBlock; first += width) {
@@ -165,7 +174,8 @@ template <class S> void boxes(const S* transforms, const Geometry<S>& geometry, 
   }
 }
 
-template <class S> void pick(const CellLanes<S>& from, int lane, Part<S>& part) {
+template <class S>
+void pick(const CellLanes<S>& from, int lane, Part<S>& part) {
   for (int m = 0; m < 3 * kMonomials; ++m) part.c[m] = from.cell.c[m][lane];
   for (int i = 0; i < 9; ++i) part.inverse[i] = from.bounds.inverse[i][lane];
   for (int i = 0; i < 3; ++i) {
@@ -176,7 +186,8 @@ template <class S> void pick(const CellLanes<S>& from, int lane, Part<S>& part) 
 }
 
 // The part's bounds, broadcast once for many queries.
-template <class S> struct Test {
+template <class S>
+struct Test {
   using V = Lanes<S>;
   V centre[3], box[3], inverse[9], reach[3];
   explicit Test(const Part<S>& part) {
@@ -194,7 +205,8 @@ template <class S> struct Test {
 };
 
 template <class S>
-void emit(Search<S>& search, const Part<S>& part, const int32_t* queries, uint32_t found, const Lanes<S>* s, const Lanes<S>* inverse) {
+void emit(Search<S>& search, const Part<S>& part, const int32_t* queries, uint32_t found, const Lanes<S>* s,
+          const Lanes<S>* inverse) {
   const Geometry<S>& geometry = search.task.geometry;
   for (; found; found &= found - 1) {
     const int lane = lowest_bit(found);
@@ -212,7 +224,8 @@ void emit(Search<S>& search, const Part<S>& part, const int32_t* queries, uint32
 }
 
 // Newton's method for `count` candidates of a part, which stand at `begin` in the scratch lists. `start` is one of kStarts.
-template <class S> void solve(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count, int start) {
+template <class S>
+void solve(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count, int start) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   const Solver<S> solver{search.task.tolerance, search.task.max_steps};
@@ -223,7 +236,8 @@ template <class S> void solve(Search<S>& search, const Part<S>& part, int64_t be
     for (int i = 0; i < 3; ++i) offset[i] = load<S>(search.scratch.at[i] + first) - part.c[kMonomials * i];
     for (int i = 0; i < 3; ++i) {
       if (start == kAffineStart) {
-        const V guess = offset[0] * part.inverse[3 * i] + offset[1] * part.inverse[3 * i + 1] + offset[2] * part.inverse[3 * i + 2];
+        const V guess =
+            offset[0] * part.inverse[3 * i] + offset[1] * part.inverse[3 * i + 1] + offset[2] * part.inverse[3 * i + 2];
         s[i] = smaller(larger(guess, V(S(-0.5))), V(S(0.5)));
       } else {
         s[i] = V(start == kCentreStart ? S(0) : start >> i & 1 ? S(0.5) : S(-0.5));
@@ -237,7 +251,8 @@ template <class S> void solve(Search<S>& search, const Part<S>& part, int64_t be
 
 // Appends the lanes in `inside` of the candidates at x, y, z to the scratch lists; returns the new end.
 template <class S>
-SNARF_HD int64_t append(Scratch<S>& scratch, int64_t end, uint32_t inside, const S* x, const S* y, const S* z, const int32_t* query) {
+SNARF_HD int64_t append(Scratch<S>& scratch, int64_t end, uint32_t inside, const S* x, const S* y, const S* z,
+                        const int32_t* query) {
   for (; inside; inside &= inside - 1, ++end) {
     const int lane = lowest_bit(inside);
     scratch.at[0][end] = x[lane];
@@ -249,7 +264,8 @@ SNARF_HD int64_t append(Scratch<S>& scratch, int64_t end, uint32_t inside, const
 }
 
 // Finds the roots in a part for `count` candidates, which stand at `begin` in the scratch lists; what follows them is free.
-template <class S> void search_part(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count) {
+template <class S>
+void search_part(Search<S>& search, const Part<S>& part, int64_t begin, int64_t count) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   if (part.curvature < S(kTame)) return solve(search, part, begin, count, kAffineStart);
@@ -300,7 +316,8 @@ template <class S> void search_part(Search<S>& search, const Part<S>& part, int6
 }
 
 template <class S>
-void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>& boxes, Scratch<S>& scratch, RootSink<S>& sink) {
+void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>& boxes, Scratch<S>& scratch,
+            RootSink<S>& sink) {
   using V = Lanes<S>;
   constexpr int width = V::width;
   const SortedQueries<S>& queries = task.queries;
@@ -346,7 +363,8 @@ void search(const CompleteTask<S>& task, const Block& block, const BlockBoxes<S>
   }
 }
 
-template <class S> void broyden_queries(const BroydenTask<S>& task, int64_t first, int64_t last, RootSink<S>& sink) {
+template <class S>
+void broyden_queries(const BroydenTask<S>& task, int64_t first, int64_t last, RootSink<S>& sink) {
   const Grid<S> grid = grid_of(task.geometry);
   const Broyden<S> settings{task.tolerance, task.divergence, task.max_steps, task.exact_jacobian};
   for (int64_t n = first; n < last; ++n) {
@@ -383,7 +401,8 @@ template <class S> void broyden_queries(const BroydenTask<S>& task, int64_t firs
 }
 
 // Twelve numbers as packs of lanes; what lies in the lanes beyond is read from behind them unless they are the last.
-template <class S> struct Row {
+template <class S>
+struct Row {
   static constexpr int packs = (12 + Lanes<S>::width - 1) / Lanes<S>::width;
   Lanes<S> pack[packs];
 
@@ -407,7 +426,8 @@ template <class S> struct Row {
   }
 };
 
-template <class S> void blend(const BlendTask<S>& task, S* transforms) {
+template <class S>
+void blend(const BlendTask<S>& task, S* transforms) {
   for (int64_t pose = 0; pose < task.poses; ++pose) {
     const S* const rows = task.rows + pose * task.bones * kRow;
     S* const out = transforms + 12 * pose * task.nodes;
@@ -426,7 +446,8 @@ template <class S> void blend(const BlendTask<S>& task, S* transforms) {
   }
 }
 
-template <class S> void blend_weights(const BlendTask<S>& task, const S* gradient, S* row, S* v_weights) {
+template <class S>
+void blend_weights(const BlendTask<S>& task, const S* gradient, S* row, S* v_weights) {
   constexpr int width = Lanes<S>::width;
   for (int64_t n = task.first; n < task.last; ++n) {
     S* const out = v_weights + n * task.bones;
@@ -447,7 +468,8 @@ template <class S> void blend_weights(const BlendTask<S>& task, const S* gradien
   }
 }
 
-template <class S> void blend_bones(const BlendTask<S>& task, const S* gradient, S* v_rows) {
+template <class S>
+void blend_bones(const BlendTask<S>& task, const S* gradient, S* v_rows) {
   for (int64_t pose = 0; pose < task.poses; ++pose)
     for (int64_t n = task.first; n < task.last; ++n) {
       if (task.used && !task.used[n]) continue;
@@ -461,7 +483,8 @@ template <class S> void blend_bones(const BlendTask<S>& task, const S* gradient,
     }
 }
 
-template <class S> void backward(const BackwardTask<S>& task) {
+template <class S>
+void backward(const BackwardTask<S>& task) {
   const Grid<S> grid = grid_of(task.geometry);
   const int64_t layer = int64_t(grid.nodes[0]) * grid.nodes[1];
   for (int64_t m = 0; m < task.roots; ++m) {
@@ -488,7 +511,10 @@ template <class S> void backward(const BackwardTask<S>& task) {
 
 }  // namespace
 
-template <class S> Kernels<S> kernels() { return {blend<S>, blend_weights<S>, blend_bones<S>, extent<S>, bins<S>, boxes<S>, search<S>, broyden_queries<S>, backward<S>}; }
+template <class S>
+Kernels<S> kernels() {
+  return {blend<S>, blend_weights<S>, blend_bones<S>, extent<S>, bins<S>, boxes<S>, search<S>, broyden_queries<S>, backward<S>};
+}
 template Kernels<float> kernels<float>();
 template Kernels<double> kernels<double>();
 

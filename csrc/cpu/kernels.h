@@ -9,22 +9,25 @@ namespace snarf {
 constexpr int kBlock = 16;  // cells side by side along x that are handled together
 
 struct Block {
-  int32_t x, y, z;   // its first cell
-  uint32_t active;   // bit k: cell x + k is searched
+  int32_t x, y, z;  // its first cell
+  uint32_t active;  // bit k: cell x + k is searched
 };
 
 // Posed boxes of a block's cells, metres; empty (lower > upper) where a cell is not searched.
-template <class S> struct BlockBoxes {
+template <class S>
+struct BlockBoxes {
   S lower[3][kBlock], upper[3][kBlock];
 };
 
-template <class S> struct Geometry {
+template <class S>
+struct Geometry {
   S lower[3], size[3];  // canonical, metres
   int32_t nodes[3];     // W, H, D
 };
 
 // The queries of one pose, sorted into uniform bins in posed space, x fastest: a run of bins in a row is one contiguous range.
-template <class S> struct SortedQueries {
+template <class S>
+struct SortedQueries {
   const S* at[3];        // coordinates, readable kBlock numbers beyond the end
   const int32_t* query;  // which query stands there
   const int32_t* begin;  // first query of each bin, [bins + 1]
@@ -33,15 +36,17 @@ template <class S> struct SortedQueries {
   int32_t bins[3];
 };
 
-template <class S> struct Root {
+template <class S>
+struct Root {
   int32_t query;
   int32_t order;  // sorts the roots of one query: the cell (complete) or the start (broyden)
   S canonical[3];
-  S inverse[9];   // of dd/dx
+  S inverse[9];  // of dd/dx
 };
 
 // Where a thread puts its roots; `more` makes room when next == end.
-template <class S> struct RootSink {
+template <class S>
+struct RootSink {
   Root<S>* next;
   Root<S>* end;
   void* owner;
@@ -49,7 +54,8 @@ template <class S> struct RootSink {
 };
 
 // Growing lists of candidate queries: their coordinates, and which they are. `reserve` makes room for `count` and kBlock more.
-template <class S> struct Scratch {
+template <class S>
+struct Scratch {
   S* at[3];
   int32_t* query;
   int64_t capacity;
@@ -57,7 +63,8 @@ template <class S> struct Scratch {
   void (*reserve)(Scratch*, int64_t count);
 };
 
-template <class S> struct CompleteTask {
+template <class S>
+struct CompleteTask {
   const S* transforms;  // of the pose, [V, 12]
   Geometry<S> geometry;
   SortedQueries<S> queries;
@@ -66,33 +73,36 @@ template <class S> struct CompleteTask {
   bool orientation_preserving;
 };
 
-template <class S> struct BroydenTask {
+template <class S>
+struct BroydenTask {
   const S* transforms;  // of the pose, [V, 12]
   Geometry<S> geometry;
-  const S* points;      // of the pose, [N, 3]
-  const S* starts;      // of the pose, [count, 12]
+  const S* points;  // of the pose, [N, 3]
+  const S* starts;  // of the pose, [count, 12]
   int64_t count;
   S tolerance, divergence, same_root;
   int32_t max_steps;
   bool exact_jacobian, orientation_preserving;
 };
 
-template <class S> struct BackwardTask {
+template <class S>
+struct BackwardTask {
   Geometry<S> geometry;
-  const S* gradient;   // [M, 3], and so on: the roots of one pose
+  const S* gradient;  // [M, 3], and so on: the roots of one pose
   const S* canonical;
   const S* inverse;
   const int64_t* query;
   int64_t roots, first_query;
-  S* v_points;         // of the pose, [N, 3], or null
-  S* v_transforms;     // of the pose, [V, 12], or null
-  int64_t layers[2];   // only nodes with z in [layers[0], layers[1]) are written
+  S* v_points;        // of the pose, [N, 3], or null
+  S* v_transforms;    // of the pose, [V, 12], or null
+  int64_t layers[2];  // only nodes with z in [layers[0], layers[1]) are written
 };
 
 constexpr int kRow = 16;  // numbers that a transform's twelve take up in `rows`
 
 // Nodes first to last of a blend.
-template <class S> struct BlendTask {
+template <class S>
+struct BlendTask {
   const S* weights;     // [V, J]
   const S* rows;        // transforms by bone, [B, J, kRow]; or by number, [B, 12, columns] (gradient of the weights)
   const uint8_t* used;  // which nodes are blended, [V], or null for all
@@ -100,7 +110,8 @@ template <class S> struct BlendTask {
   int64_t first, last;
 };
 
-template <class S> struct Kernels {
+template <class S>
+struct Kernels {
   // transforms [B, V, 12] of the task's nodes.
   void (*blend)(const BlendTask<S>&, S* transforms);
   // v_weights [V, J] of the task's nodes, from the gradient by the transforms, [B, V, 12]; `row` has room for the columns.
@@ -120,8 +131,17 @@ template <class S> struct Kernels {
   void (*backward)(const BackwardTask<S>&);
 };
 
-namespace avx512 { template <class S> Kernels<S> kernels(); }
-namespace avx2 { template <class S> Kernels<S> kernels(); }
-namespace baseline { template <class S> Kernels<S> kernels(); }
+namespace avx512 {
+template <class S>
+Kernels<S> kernels();
+}
+namespace avx2 {
+template <class S>
+Kernels<S> kernels();
+}
+namespace baseline {
+template <class S>
+Kernels<S> kernels();
+}
 
 }  // namespace snarf

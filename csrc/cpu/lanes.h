@@ -1,6 +1,7 @@
 // Packs of SIMD lanes behind the operators of a scalar, for the shared mathematics.
 //
-// GCC and Clang compile their vector types to whatever the translation unit's flags allow; other compilers get loops over arrays.
+// GCC and Clang compile their vector types to whatever the translation unit's flags allow; other compilers get loops over
+// arrays.
 #pragma once
 
 #include <stdint.h>
@@ -23,15 +24,26 @@ constexpr int kVectorBytes = 32;
 constexpr int kVectorBytes = 16;
 #endif
 
-template <class S> struct IntegerOf;
-template <> struct IntegerOf<float> { using type = int32_t; };
-template <> struct IntegerOf<double> { using type = int64_t; };
+template <class S>
+struct IntegerOf;
+template <>
+struct IntegerOf<float> {
+  using type = int32_t;
+};
+template <>
+struct IntegerOf<double> {
+  using type = int64_t;
+};
 
 #if defined(__GNUC__)
 
-template <class T, int W> struct Pack { typedef T type __attribute__((vector_size(W * sizeof(T)))); };
+template <class T, int W>
+struct Pack {
+  typedef T type __attribute__((vector_size(W * sizeof(T))));
+};
 
-template <class S> struct Lanes {
+template <class S>
+struct Lanes {
   static constexpr int width = kVectorBytes / int(sizeof(S));
   using Vector = typename Pack<S, width>::type;
   Vector v;
@@ -41,7 +53,8 @@ template <class S> struct Lanes {
   SNARF_HD S operator[](int lane) const { return v[lane]; }
 };
 
-template <class S> struct LaneMask {
+template <class S>
+struct LaneMask {
   using Integer = typename IntegerOf<S>::type;
   using Vector = typename Pack<Integer, Lanes<S>::width>::type;
   Vector v;  // all bits of a lane set, or none
@@ -49,17 +62,19 @@ template <class S> struct LaneMask {
 
 #else
 
-template <class T, int W> struct Array {
+template <class T, int W>
+struct Array {
   T at[W];
   T& operator[](int i) { return at[i]; }
   T operator[](int i) const { return at[i]; }
 };
 
-#define SNARF_EACH(result, type, expression)                     \
-  template <class T, int W> SNARF_HD Array<type, W> result {     \
-    Array<type, W> out;                                          \
-    for (int i = 0; i < W; ++i) out.at[i] = expression;          \
-    return out;                                                  \
+#define SNARF_EACH(result, type, expression)            \
+  template <class T, int W>                             \
+  SNARF_HD Array<type, W> result {                      \
+    Array<type, W> out;                                 \
+    for (int i = 0; i < W; ++i) out.at[i] = expression; \
+    return out;                                         \
   }
 SNARF_EACH(operator+(const Array<T, W>& a, const Array<T, W>& b), T, a.at[i] + b.at[i])
 SNARF_EACH(operator-(const Array<T, W>& a, const Array<T, W>& b), T, a.at[i] - b.at[i])
@@ -70,17 +85,21 @@ SNARF_EACH(operator|(const Array<T, W>& a, const Array<T, W>& b), T, a.at[i] | b
 SNARF_EACH(operator~(const Array<T, W>& a), T, ~a.at[i])
 #undef SNARF_EACH
 
-template <class S> struct Lanes {
+template <class S>
+struct Lanes {
   static constexpr int width = kVectorBytes / int(sizeof(S));
   using Vector = Array<S, width>;
   Vector v;
   SNARF_HD Lanes() {}
   SNARF_HD Lanes(Vector vector) : v(vector) {}
-  SNARF_HD Lanes(S scalar) { for (int i = 0; i < width; ++i) v.at[i] = scalar; }
+  SNARF_HD Lanes(S scalar) {
+    for (int i = 0; i < width; ++i) v.at[i] = scalar;
+  }
   SNARF_HD S operator[](int lane) const { return v.at[lane]; }
 };
 
-template <class S> struct LaneMask {
+template <class S>
+struct LaneMask {
   using Integer = typename IntegerOf<S>::type;
   using Vector = Array<Integer, Lanes<S>::width>;
   Vector v;
@@ -88,11 +107,14 @@ template <class S> struct LaneMask {
 
 #endif
 
-#define SNARF_OPERATOR(op)                                                                              \
-  template <class S> SNARF_HD Lanes<S> operator op(Lanes<S> a, Lanes<S> b) { return {a.v op b.v}; }     \
-  SNARF_HD Lanes<float> operator op(Lanes<float> a, float b) { return a op Lanes<float>(b); }           \
-  SNARF_HD Lanes<float> operator op(float a, Lanes<float> b) { return Lanes<float>(a) op b; }           \
-  SNARF_HD Lanes<double> operator op(Lanes<double> a, double b) { return a op Lanes<double>(b); }       \
+#define SNARF_OPERATOR(op)                                                                        \
+  template <class S>                                                                              \
+  SNARF_HD Lanes<S> operator op(Lanes<S> a, Lanes<S> b) {                                         \
+    return {a.v op b.v};                                                                          \
+  }                                                                                               \
+  SNARF_HD Lanes<float> operator op(Lanes<float> a, float b) { return a op Lanes<float>(b); }     \
+  SNARF_HD Lanes<float> operator op(float a, Lanes<float> b) { return Lanes<float>(a) op b; }     \
+  SNARF_HD Lanes<double> operator op(Lanes<double> a, double b) { return a op Lanes<double>(b); } \
   SNARF_HD Lanes<double> operator op(double a, Lanes<double> b) { return Lanes<double>(a) op b; }
 SNARF_OPERATOR(+)
 SNARF_OPERATOR(-)
@@ -101,18 +123,22 @@ SNARF_OPERATOR(/)
 #undef SNARF_OPERATOR
 
 #if defined(__GNUC__)
-#define SNARF_COMPARE(op)                                                                                    \
-  template <class S> SNARF_HD LaneMask<S> operator op(Lanes<S> a, Lanes<S> b) { return {a.v op b.v}; }       \
-  SNARF_HD LaneMask<float> operator op(Lanes<float> a, float b) { return a op Lanes<float>(b); }             \
+#define SNARF_COMPARE(op)                                                                        \
+  template <class S>                                                                             \
+  SNARF_HD LaneMask<S> operator op(Lanes<S> a, Lanes<S> b) {                                     \
+    return {a.v op b.v};                                                                         \
+  }                                                                                              \
+  SNARF_HD LaneMask<float> operator op(Lanes<float> a, float b) { return a op Lanes<float>(b); } \
   SNARF_HD LaneMask<double> operator op(Lanes<double> a, double b) { return a op Lanes<double>(b); }
 #else
-#define SNARF_COMPARE(op)                                                                                    \
-  template <class S> SNARF_HD LaneMask<S> operator op(Lanes<S> a, Lanes<S> b) {                              \
-    LaneMask<S> out;                                                                                         \
-    for (int i = 0; i < Lanes<S>::width; ++i) out.v.at[i] = a.v.at[i] op b.v.at[i] ? -1 : 0;                 \
-    return out;                                                                                              \
-  }                                                                                                          \
-  SNARF_HD LaneMask<float> operator op(Lanes<float> a, float b) { return a op Lanes<float>(b); }             \
+#define SNARF_COMPARE(op)                                                                        \
+  template <class S>                                                                             \
+  SNARF_HD LaneMask<S> operator op(Lanes<S> a, Lanes<S> b) {                                     \
+    LaneMask<S> out;                                                                             \
+    for (int i = 0; i < Lanes<S>::width; ++i) out.v.at[i] = a.v.at[i] op b.v.at[i] ? -1 : 0;     \
+    return out;                                                                                  \
+  }                                                                                              \
+  SNARF_HD LaneMask<float> operator op(Lanes<float> a, float b) { return a op Lanes<float>(b); } \
   SNARF_HD LaneMask<double> operator op(Lanes<double> a, double b) { return a op Lanes<double>(b); }
 #endif
 SNARF_COMPARE(<)
@@ -122,11 +148,21 @@ SNARF_COMPARE(>=)
 SNARF_COMPARE(!=)
 #undef SNARF_COMPARE
 
-template <class S> SNARF_HD LaneMask<S> operator&(LaneMask<S> a, LaneMask<S> b) { return {a.v & b.v}; }
-template <class S> SNARF_HD LaneMask<S> operator|(LaneMask<S> a, LaneMask<S> b) { return {a.v | b.v}; }
-template <class S> SNARF_HD LaneMask<S> operator!(LaneMask<S> a) { return {~a.v}; }
+template <class S>
+SNARF_HD LaneMask<S> operator&(LaneMask<S> a, LaneMask<S> b) {
+  return {a.v & b.v};
+}
+template <class S>
+SNARF_HD LaneMask<S> operator|(LaneMask<S> a, LaneMask<S> b) {
+  return {a.v | b.v};
+}
+template <class S>
+SNARF_HD LaneMask<S> operator!(LaneMask<S> a) {
+  return {~a.v};
+}
 
-template <class S> SNARF_HD Lanes<S> select(LaneMask<S> mask, Lanes<S> a, Lanes<S> b) {
+template <class S>
+SNARF_HD Lanes<S> select(LaneMask<S> mask, Lanes<S> a, Lanes<S> b) {
 #if defined(__GNUC__)
   return {mask.v ? a.v : b.v};
 #else
@@ -135,12 +171,22 @@ template <class S> SNARF_HD Lanes<S> select(LaneMask<S> mask, Lanes<S> a, Lanes<
   return out;
 #endif
 }
-template <class S> SNARF_HD Lanes<S> larger(Lanes<S> a, Lanes<S> b) { return select(a > b, a, b); }
-template <class S> SNARF_HD Lanes<S> smaller(Lanes<S> a, Lanes<S> b) { return select(a < b, a, b); }
-template <class S> SNARF_HD Lanes<S> absolute(Lanes<S> a) { return larger(a, Lanes<S>(S(0)) - a); }
+template <class S>
+SNARF_HD Lanes<S> larger(Lanes<S> a, Lanes<S> b) {
+  return select(a > b, a, b);
+}
+template <class S>
+SNARF_HD Lanes<S> smaller(Lanes<S> a, Lanes<S> b) {
+  return select(a < b, a, b);
+}
+template <class S>
+SNARF_HD Lanes<S> absolute(Lanes<S> a) {
+  return larger(a, Lanes<S>(S(0)) - a);
+}
 
 // Rounded towards zero; for numbers that fit the integer of the same size.
-template <class S> SNARF_HD Lanes<S> truncate(Lanes<S> a) {
+template <class S>
+SNARF_HD Lanes<S> truncate(Lanes<S> a) {
 #if defined(__GNUC__)
   return {__builtin_convertvector(__builtin_convertvector(a.v, typename LaneMask<S>::Vector), typename Lanes<S>::Vector)};
 #else
@@ -150,15 +196,20 @@ template <class S> SNARF_HD Lanes<S> truncate(Lanes<S> a) {
 #endif
 }
 
-template <class S> SNARF_HD Lanes<S> load(const S* at) {
+template <class S>
+SNARF_HD Lanes<S> load(const S* at) {
   Lanes<S> out;
   memcpy(&out.v, at, sizeof out.v);
   return out;
 }
-template <class S> SNARF_HD void store(S* at, Lanes<S> value) { memcpy(at, &value.v, sizeof value.v); }
+template <class S>
+SNARF_HD void store(S* at, Lanes<S> value) {
+  memcpy(at, &value.v, sizeof value.v);
+}
 
 // The numbers 0 to 11 of `width` rows as twelve packs, one lane a row.
-template <class S> SNARF_HD void load_rows(const S* const* row, Lanes<S>* out) {
+template <class S>
+SNARF_HD void load_rows(const S* const* row, Lanes<S>* out) {
   constexpr int width = Lanes<S>::width;
   for (int r = 0; r < 12; ++r) {
     S column[width];
@@ -168,7 +219,8 @@ template <class S> SNARF_HD void load_rows(const S* const* row, Lanes<S>* out) {
 }
 
 // a moved down by one lane, and `last` in the highest.
-template <class S> SNARF_HD Lanes<S> shifted(Lanes<S> a, S last) {
+template <class S>
+SNARF_HD Lanes<S> shifted(Lanes<S> a, S last) {
   constexpr int width = Lanes<S>::width;
   S values[width + 1];
   store(values, a);
@@ -187,8 +239,10 @@ SNARF_HD void load_rows(const float* const* row, Lanes<float>* out) {
       part[i] = _mm512_insertf32x4(part[i], _mm_loadu_ps(row[8 + i] + r), 2);
       part[i] = _mm512_insertf32x4(part[i], _mm_loadu_ps(row[12 + i] + r), 3);
     }
-    const __m512d a = _mm512_castps_pd(_mm512_unpacklo_ps(part[0], part[1])), b = _mm512_castps_pd(_mm512_unpackhi_ps(part[0], part[1]));
-    const __m512d c = _mm512_castps_pd(_mm512_unpacklo_ps(part[2], part[3])), d = _mm512_castps_pd(_mm512_unpackhi_ps(part[2], part[3]));
+    const __m512d a = _mm512_castps_pd(_mm512_unpacklo_ps(part[0], part[1])),
+                  b = _mm512_castps_pd(_mm512_unpackhi_ps(part[0], part[1]));
+    const __m512d c = _mm512_castps_pd(_mm512_unpacklo_ps(part[2], part[3])),
+                  d = _mm512_castps_pd(_mm512_unpackhi_ps(part[2], part[3]));
     out[r].v = (Lanes<float>::Vector)_mm512_unpacklo_pd(a, c);
     out[r + 1].v = (Lanes<float>::Vector)_mm512_unpackhi_pd(a, c);
     out[r + 2].v = (Lanes<float>::Vector)_mm512_unpacklo_pd(b, d);
@@ -205,8 +259,10 @@ SNARF_HD void load_rows(const float* const* row, Lanes<float>* out) {
     __m256 part[4];
     for (int i = 0; i < 4; ++i)
       part[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row[i] + r)), _mm_loadu_ps(row[4 + i] + r), 1);
-    const __m256d a = _mm256_castps_pd(_mm256_unpacklo_ps(part[0], part[1])), b = _mm256_castps_pd(_mm256_unpackhi_ps(part[0], part[1]));
-    const __m256d c = _mm256_castps_pd(_mm256_unpacklo_ps(part[2], part[3])), d = _mm256_castps_pd(_mm256_unpackhi_ps(part[2], part[3]));
+    const __m256d a = _mm256_castps_pd(_mm256_unpacklo_ps(part[0], part[1])),
+                  b = _mm256_castps_pd(_mm256_unpackhi_ps(part[0], part[1]));
+    const __m256d c = _mm256_castps_pd(_mm256_unpacklo_ps(part[2], part[3])),
+                  d = _mm256_castps_pd(_mm256_unpackhi_ps(part[2], part[3]));
     out[r].v = (Lanes<float>::Vector)_mm256_unpacklo_pd(a, c);
     out[r + 1].v = (Lanes<float>::Vector)_mm256_unpackhi_pd(a, c);
     out[r + 2].v = (Lanes<float>::Vector)_mm256_unpacklo_pd(b, d);
@@ -216,7 +272,8 @@ SNARF_HD void load_rows(const float* const* row, Lanes<float>* out) {
 #endif
 
 // One bit per lane, lane 0 lowest.
-template <class S> SNARF_HD uint32_t bits(LaneMask<S> mask) {
+template <class S>
+SNARF_HD uint32_t bits(LaneMask<S> mask) {
 #if defined(__GNUC__) && defined(__AVX512DQ__)
   if (sizeof(S) == 4) return (uint32_t)_mm512_movepi32_mask((__m512i)mask.v);
   return (uint32_t)_mm512_movepi64_mask((__m512i)mask.v);
@@ -229,10 +286,14 @@ template <class S> SNARF_HD uint32_t bits(LaneMask<S> mask) {
   return out;
 #endif
 }
-template <class S> SNARF_HD bool any(LaneMask<S> mask) { return bits(mask) != 0; }
+template <class S>
+SNARF_HD bool any(LaneMask<S> mask) {
+  return bits(mask) != 0;
+}
 
 // The mask whose first `count` lanes are set.
-template <class S> SNARF_HD LaneMask<S> first_lanes(int count) {
+template <class S>
+SNARF_HD LaneMask<S> first_lanes(int count) {
   LaneMask<S> out;
   for (int i = 0; i < Lanes<S>::width; ++i) out.v[i] = i < count ? -1 : 0;
   return out;

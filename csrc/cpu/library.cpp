@@ -54,14 +54,15 @@ void broyden_search(const snarf_field& field, const snarf_queries& queries, cons
 }
 
 template <class S>
-void implicit_backward(const snarf_field& field, const snarf_queries& queries, int64_t roots, const S* gradient, const S* canonical,
-                       const int64_t* query, const S* inverse, S* v_points, S* v_transforms) {
+void implicit_backward(const snarf_field& field, const snarf_queries& queries, int64_t roots, const S* gradient,
+                       const S* canonical, const int64_t* query, const S* inverse, S* v_points, S* v_transforms) {
   const int64_t nodes = node_count(field), layers = field.nodes[2];
   if (v_points) std::fill(v_points, v_points + 3 * queries.poses * queries.count, S(0));
   if (v_transforms) std::fill(v_transforms, v_transforms + 12 * queries.poses * nodes, S(0));
   if (!roots || !queries.poses || !queries.count) return;
   const int threads = threads_for(queries, roots);
-  // Poses write to nodes of their own; those of a pose are cut into layers, whose owners pass over the same roots in the same order.
+  // Poses write to nodes of their own; those of a pose are cut into layers, whose owners pass over the same roots in the same
+  // order.
   const int64_t slabs = std::min<int64_t>(layers, (threads + queries.poses - 1) / queries.poses);
   Queue transforms_queue(v_transforms ? queries.poses * slabs : 0, 1), points_queue(v_points ? queries.poses : 0, 1);
   const auto task_of = [&](int64_t pose) {
@@ -81,19 +82,19 @@ void implicit_backward(const snarf_field& field, const snarf_queries& queries, i
     return task;
   };
   const bool well = run_phases(threads, {[&](int) {
-    for (int64_t n, end; transforms_queue.take(n, end);) {
-      BackwardTask<S> task = task_of(n / slabs);
-      task.v_transforms = v_transforms + 12 * nodes * (n / slabs);
-      task.layers[0] = layers * (n % slabs) / slabs;
-      task.layers[1] = layers * (n % slabs + 1) / slabs;
-      kernels<S>().backward(task);
-    }
-    for (int64_t pose, end; points_queue.take(pose, end);) {
-      BackwardTask<S> task = task_of(pose);
-      task.v_points = v_points + 3 * queries.count * pose;
-      kernels<S>().backward(task);
-    }
-  }});
+                                 for (int64_t n, end; transforms_queue.take(n, end);) {
+                                   BackwardTask<S> task = task_of(n / slabs);
+                                   task.v_transforms = v_transforms + 12 * nodes * (n / slabs);
+                                   task.layers[0] = layers * (n % slabs) / slabs;
+                                   task.layers[1] = layers * (n % slabs + 1) / slabs;
+                                   kernels<S>().backward(task);
+                                 }
+                                 for (int64_t pose, end; points_queue.take(pose, end);) {
+                                   BackwardTask<S> task = task_of(pose);
+                                   task.v_points = v_points + 3 * queries.count * pose;
+                                   kernels<S>().backward(task);
+                                 }
+                               }});
   if (!well) throw std::bad_alloc();
 }
 
@@ -115,13 +116,14 @@ bool valid(const snarf_field* field, const snarf_queries* queries) {
 }
 
 // Calls run(number) with a float or a double; no exception leaves the library.
-template <class Run> int in_number_type(int bytes, const Run& run) {
+template <class Run>
+int in_number_type(int bytes, const Run& run) {
   try {
-    if (bytes == 4) run(float());
-    else run(double());
-  } catch (...) {
-    return SNARF_OUT_OF_MEMORY;
-  }
+    if (bytes == 4)
+      run(float());
+    else
+      run(double());
+  } catch (...) { return SNARF_OUT_OF_MEMORY; }
   return SNARF_OK;
 }
 
@@ -164,15 +166,14 @@ int snarf_blend_backward(const snarf_blending* blending, const void* gradient, v
   });
 }
 
-int snarf_complete_search(const snarf_field* field, const snarf_queries* queries, const snarf_complete* settings, snarf_roots** roots,
-                          int64_t* found) {
+int snarf_complete_search(const snarf_field* field, const snarf_queries* queries, const snarf_complete* settings,
+                          snarf_roots** roots, int64_t* found) {
   if (!settings) return SNARF_BAD_ARGUMENT;
-  return search_with(field, queries, roots, found,
-                     [&](auto& out) { complete_search(*field, *queries, *settings, out); });
+  return search_with(field, queries, roots, found, [&](auto& out) { complete_search(*field, *queries, *settings, out); });
 }
 
-int snarf_broyden_search(const snarf_field* field, const snarf_queries* queries, const snarf_broyden* settings, snarf_roots** roots,
-                         int64_t* found) {
+int snarf_broyden_search(const snarf_field* field, const snarf_queries* queries, const snarf_broyden* settings,
+                         snarf_roots** roots, int64_t* found) {
   if (!settings || settings->count < 0) return SNARF_BAD_ARGUMENT;
   return search_with(field, queries, roots, found, [&](auto& out) { broyden_search(*field, *queries, *settings, out); });
 }
@@ -182,9 +183,7 @@ int snarf_take_roots(snarf_roots* roots, void* canonical, int64_t* query, void* 
   if (!roots || !canonical || !query || !jacobian_inverse) return SNARF_OK;
   try {
     return owner->take(canonical, query, jacobian_inverse) ? SNARF_OK : SNARF_OUT_OF_MEMORY;
-  } catch (...) {
-    return SNARF_OUT_OF_MEMORY;
-  }
+  } catch (...) { return SNARF_OUT_OF_MEMORY; }
 }
 
 int snarf_implicit_backward(const snarf_field* field, const snarf_queries* queries, int64_t roots, const void* gradient,
@@ -198,7 +197,8 @@ int snarf_implicit_backward(const snarf_field* field, const snarf_queries* queri
   });
 }
 
-int snarf_evaluate(const snarf_network* network, const float* points, const float* extras, int64_t count, int32_t threads, float* logits) {
+int snarf_evaluate(const snarf_network* network, const float* points, const float* extras, int64_t count, int32_t threads,
+                   float* logits) {
   if (!valid(network, points, extras, count, threads, logits)) return SNARF_BAD_ARGUMENT;
   return in_number_type(4, [&](auto) { Network(*network).run(points, extras, count, threads, logits); });
 }

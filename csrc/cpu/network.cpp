@@ -69,24 +69,23 @@ SNARF_HD V activated(V x, int activation, float sharpness) {
   return activation == 2 ? softplus(x, sharpness) : x;
 }
 
-void run_layer(const NetworkLayer& layer, const float* hidden, const float* encoded, const float* extras, float sharpness, float* out) {
+void run_layer(const NetworkLayer& layer, const float* hidden, const float* encoded, const float* extras, float sharpness,
+               float* out) {
   const int inputs = layer.hidden + layer.encoded + layer.extras;
   for (int o = 0; o < layer.outputs; o += kOutputs) {
     const float* const weights = layer.weights + int64_t(o) * inputs;
     for (int column = 0; column < kTile; column += kColumn) {
       V sums[kOutputs][kPacks];
       SNARF_UNROLL
-      for (int i = 0; i < kOutputs; ++i)
-        SNARF_UNROLL
-        for (int p = 0; p < kPacks; ++p) sums[i][p] = V(layer.bias[o + i]);
+      for (int i = 0; i < kOutputs; ++i) SNARF_UNROLL
+      for (int p = 0; p < kPacks; ++p) sums[i][p] = V(layer.bias[o + i]);
       add_products(weights, hidden + column, layer.hidden, sums);
       add_products(weights + kOutputs * layer.hidden, encoded + column, layer.encoded, sums);
       add_products(weights + kOutputs * (layer.hidden + layer.encoded), extras + column, layer.extras, sums);
       SNARF_UNROLL
-      for (int i = 0; i < kOutputs; ++i)
-        SNARF_UNROLL
-        for (int p = 0; p < kPacks; ++p)
-          store(out + (o + i) * kTile + column + p * V::width, activated(sums[i][p], layer.activation, sharpness));
+      for (int i = 0; i < kOutputs; ++i) SNARF_UNROLL
+      for (int p = 0; p < kPacks; ++p)
+        store(out + (o + i) * kTile + column + p * V::width, activated(sums[i][p], layer.activation, sharpness));
     }
   }
 }
@@ -109,8 +108,8 @@ SNARF_HD void sine_cosine(V angle, V& sine, V& cosine) {
   c = c * q + V(-0.5f);
   c = c * q + V(1.f);
   const V half = truncate(quarter * V(0.5f)), fourth = truncate(quarter * V(0.25f));
-  const V odd = absolute(quarter - half * V(2.f));       // 1 on odd quarters
-  const V rest = quarter - fourth * V(4.f);              // -3 to 3
+  const V odd = absolute(quarter - half * V(2.f));  // 1 on odd quarters
+  const V rest = quarter - fourth * V(4.f);         // -3 to 3
   const LaneMask<float> swap = odd > 0.5f;
   const LaneMask<float> sine_down = ((rest >= 1.5f) & (rest <= 3.5f)) | ((rest >= -2.5f) & (rest <= -0.5f));
   const LaneMask<float> cosine_down = ((rest >= 0.5f) & (rest <= 2.5f)) | ((rest >= -3.5f) & (rest <= -1.5f));

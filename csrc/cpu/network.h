@@ -23,7 +23,8 @@ inline NetworkKernel network_kernel() {
   return baseline::network_kernel();
 }
 
-inline bool valid(const snarf_network* network, const float* points, const float* extras, int64_t count, int threads, const float* out) {
+inline bool valid(const snarf_network* network, const float* points, const float* extras, int64_t count, int threads,
+                  const float* out) {
   if (!network || !network->layers || network->layer_count < 1 || count < 0 || threads < 1) return false;
   if (count && (!points || !out || (network->extra_count && !extras))) return false;
   if (network->frequency_count < 0 || network->extra_count < 0 || network->segment_count < 0) return false;
@@ -71,12 +72,13 @@ class Network {
     threads = int(std::max<int64_t>(1, std::min<int64_t>(threads, count / kPointsPerThread)));
     const NetworkKernel kernel = network_kernel();
     Queue tiles((count + kTile - 1) / kTile, 4);
-    const bool well = run_phases(threads, {[&](int) {
-      std::vector<float> scratch(size_t(task_.scratch()) + 16);
-      float* const aligned = reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(scratch.data()) + 63) & ~uintptr_t(63));
-      for (int64_t first, last; tiles.take(first, last);)
-        kernel(task_, first * kTile, std::min(last * kTile, count), aligned);
-    }});
+    const bool well = run_phases(
+        threads, {[&](int) {
+          std::vector<float> scratch(size_t(task_.scratch()) + 16);
+          float* const aligned = reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(scratch.data()) + 63) & ~uintptr_t(63));
+          for (int64_t first, last; tiles.take(first, last);)
+            kernel(task_, first * kTile, std::min(last * kTile, count), aligned);
+        }});
     if (!well) throw std::bad_alloc();
   }
 

@@ -22,13 +22,15 @@ namespace snarf {
 constexpr int64_t kWorkPerThread = 2048;  // queries, roots or nodes; less is not worth starting a thread for
 
 // The roots that one thread found, in blocks that never move.
-template <class S> class RootList {
+template <class S>
+class RootList {
  public:
   RootList() : sink_{nullptr, nullptr, this, more} {}
   RootList(const RootList&) = delete;
   RootSink<S>& sink() { return sink_; }
 
-  template <class F> void each(const F& visit) {
+  template <class F>
+  void each(const F& visit) {
     for (size_t n = 0; n < blocks_.size(); ++n) {
       Root<S>* const begin = blocks_[n].get();
       Root<S>* const end = n + 1 < blocks_.size() ? begin + sizes_[n] : sink_.next;
@@ -62,14 +64,16 @@ inline void prefetch(const void* at) {
 }
 
 // The roots of a group of consecutive queries, sorted.
-template <class S> struct Group {
+template <class S>
+struct Group {
   int64_t first_query = 0;  // flat
   std::vector<std::unique_ptr<RootList<S>>> lists;
   std::unique_ptr<const Root<S>*[]> sorted;
   int64_t count = 0;
 };
 
-template <class S> struct RootsOf final : snarf_roots {
+template <class S>
+struct RootsOf final : snarf_roots {
   std::vector<std::unique_ptr<Group<S>>> groups;
   int threads = 1;
 
@@ -88,15 +92,15 @@ template <class S> struct RootsOf final : snarf_roots {
       const Group<S>& from = *group;
       Queue queue(from.count, 4096);
       const bool well = run_phases(from.count > 4 * kWorkPerThread ? threads : 1, {[&](int) {
-        for (int64_t first, last; queue.take(first, last);)
-          for (int64_t m = first; m < last; ++m) {
-            prefetch(from.sorted[std::min(m + kAhead, last - 1)]);
-            const Root<S>& root = *from.sorted[m];
-            q[m] = from.first_query + root.query;
-            std::memcpy(x + 3 * m, root.canonical, sizeof root.canonical);
-            std::memcpy(inv + 9 * m, root.inverse, sizeof root.inverse);
-          }
-      }});
+                                     for (int64_t first, last; queue.take(first, last);)
+                                       for (int64_t m = first; m < last; ++m) {
+                                         prefetch(from.sorted[std::min(m + kAhead, last - 1)]);
+                                         const Root<S>& root = *from.sorted[m];
+                                         q[m] = from.first_query + root.query;
+                                         std::memcpy(x + 3 * m, root.canonical, sizeof root.canonical);
+                                         std::memcpy(inv + 9 * m, root.inverse, sizeof root.inverse);
+                                       }
+                                   }});
       if (!well) return false;
       done += from.count;
       group.reset();
@@ -107,27 +111,31 @@ template <class S> struct RootsOf final : snarf_roots {
 };
 
 // Several starts may report one root with inverses that differ in the last bits: only identical reports compare equal.
-template <class S> bool comes_before(const Root<S>* a, const Root<S>* b) {
+template <class S>
+bool comes_before(const Root<S>* a, const Root<S>* b) {
   if (a->order != b->order) return a->order < b->order;
   for (int i = 0; i < 3; ++i)
     if (a->canonical[i] != b->canonical[i]) return a->canonical[i] < b->canonical[i];
   return std::lexicographical_compare(a->inverse, a->inverse + 9, b->inverse, b->inverse + 9);
 }
 
-template <class S> S determinant(const S* m) {
+template <class S>
+S determinant(const S* m) {
   return m[0] * (m[4] * m[8] - m[5] * m[7]) + m[1] * (m[5] * m[6] - m[3] * m[8]) + m[2] * (m[3] * m[7] - m[4] * m[6]);
 }
 
 // Two reports of one root, by neighbouring cells or several starts. The two roots beside a fold may be as close, but differ in
 // orientation.
-template <class S> bool same_root(const Root<S>& a, const Root<S>& b, S distance) {
+template <class S>
+bool same_root(const Root<S>& a, const Root<S>& b, S distance) {
   S square = 0;
   for (int i = 0; i < 3; ++i) square += (a.canonical[i] - b.canonical[i]) * (a.canonical[i] - b.canonical[i]);
   return square < distance * distance && (determinant(a.inverse) > 0) == (determinant(b.inverse) > 0);
 }
 
 // Phases that sort the lists' roots by query and drop duplicates.
-template <class S> class Collect {
+template <class S>
+class Collect {
  public:
   Collect(Group<S>& group, int64_t queries, int threads, S distance)
       : group_(group), queries_(queries), distance_(distance), counting_(threads, 1), placing_(threads, 1), threads_(threads) {}

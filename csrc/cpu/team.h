@@ -1,7 +1,7 @@
 // Threads that work through the phases of one call together.
 //
-// They live for one call only: between calls none of them takes time from the caller's own threads, and a forked process has none
-// to miss.
+// They live for one call only: between calls none of them takes time from the caller's own threads, and a forked process has
+// none to miss.
 #pragma once
 
 #include <atomic>
@@ -69,9 +69,7 @@ inline bool run_phases(int threads, const std::vector<std::function<void(int)>>&
       // After a failure the threads still meet at every barrier: who left early would be waited for.
       try {
         for (int thread = first; thread < last && !failed; ++thread) phase(thread);
-      } catch (...) {
-        failed = true;
-      }
+      } catch (...) { failed = true; }
       barrier.wait(last - first);
     }
   };

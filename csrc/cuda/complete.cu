@@ -28,16 +28,18 @@ constexpr int kCurvedThreads = 64;  // in search_curved, whose parts fill the sh
 constexpr float kFarthest = 1e30f;  // metres
 
 // A cell or a part of one, ready to be searched. Aligned so that it moves in 16-byte pieces.
-template <class S> struct alignas(16) Record {
+template <class S>
+struct alignas(16) Record {
   Cell<S> cell;
   CellBounds<S> bounds;
 };
 
 // Uniform bins over a box in posed space.
-template <class S> struct Bins {
+template <class S>
+struct Bins {
   S lower[3], upper[3];  // metres
   S per_metre;
-  int number[3];         // 0 if nothing lies in the box
+  int number[3];  // 0 if nothing lies in the box
 };
 
 // ------------------------------------------------------------------------------------------------ bounds and bins
@@ -58,15 +60,20 @@ SNARF_HD float rounded_up(double value) {
 }
 
 // Widens bounds (upper, -lower) by an interval along one axis.
-template <class S> __device__ void widen(unsigned* bounds, int axis, S lower, S upper) {
+template <class S>
+__device__ void widen(unsigned* bounds, int axis, S lower, S upper) {
   atomicMax(bounds + axis, ordered(rounded_up(upper)));
   atomicMax(bounds + 3 + axis, ordered(rounded_up(-lower)));
 }
 
-template <class S> __device__ int number_of_bins(S extent, S per_metre) { return int(extent * per_metre) + 1; }
+template <class S>
+__device__ int number_of_bins(S extent, S per_metre) {
+  return int(extent * per_metre) + 1;
+}
 
 // Lays out as many bins as allowed over the region where both cells and queries are, with equal sides.
-template <class S> __device__ void lay_out(const unsigned* region, int most, Bins<S>& bins) {
+template <class S>
+__device__ void lay_out(const unsigned* region, int most, Bins<S>& bins) {
   S extent[3], longest = 0;
   bool filled = true;
   for (int i = 0; i < 3; ++i) {
@@ -93,13 +100,15 @@ template <class S> __device__ void lay_out(const unsigned* region, int most, Bin
 }
 
 // Grows with the position, so that a query inside a box never lies outside the box's bins.
-template <class S> __device__ int bin_along(const Bins<S>& bins, int axis, S position) {
+template <class S>
+__device__ int bin_along(const Bins<S>& bins, int axis, S position) {
   S at = (position - bins.lower[axis]) * bins.per_metre;
   return at > 0 ? (at < S(bins.number[axis]) ? int(at) : bins.number[axis] - 1) : 0;
 }
 
 // The bin of a query, or -1 if the query is not in the region.
-template <class S> __device__ int bin_of(const Bins<S>& bins, const S* p) {
+template <class S>
+__device__ int bin_of(const Bins<S>& bins, const S* p) {
   if (!bins.number[0]) return -1;
   int at[3];
   for (int i = 0; i < 3; ++i) {
@@ -110,13 +119,15 @@ template <class S> __device__ int bin_of(const Bins<S>& bins, const S* p) {
 }
 
 // ------------------------------------------------------------------------------------------------ cells
-template <class S> __device__ void centre_of(const Grid<S>& grid, int cell, S* centre) {
+template <class S>
+__device__ void centre_of(const Grid<S>& grid, int cell, S* centre) {
   const int x = cell % (grid.nodes[0] - 1), rest = cell / (grid.nodes[0] - 1);
   const int index[3] = {x, rest % (grid.nodes[1] - 1), rest / (grid.nodes[1] - 1)};
   for (int i = 0; i < 3; ++i) centre[i] = grid.lower[i] + (S(index[i]) + S(0.5)) * grid.size[i];
 }
 
-template <class S> __device__ void record_cell(const Search<S>& a, const Grid<S>& grid, int cell, Record<S>& record) {
+template <class S>
+__device__ void record_cell(const Search<S>& a, const Grid<S>& grid, int cell, Record<S>& record) {
   const int x = cell % (grid.nodes[0] - 1), rest = cell / (grid.nodes[0] - 1);
   const int y = rest % (grid.nodes[1] - 1), z = rest / (grid.nodes[1] - 1);
   const long long first = ((long long)z * grid.nodes[1] + y) * grid.nodes[0] + x;
@@ -133,7 +144,8 @@ template <class S> __device__ void record_cell(const Search<S>& a, const Grid<S>
 }
 
 // Non-finite or absurd transforms give no root.
-template <class S> __device__ bool is_usable(const Record<S>& record) {
+template <class S>
+__device__ bool is_usable(const Record<S>& record) {
   bool usable = true;
   for (int i = 0; i < 3; ++i) {
     const S centre = record.cell.c[kMonomials * i];
@@ -217,7 +229,8 @@ extern "C" __global__ void __launch_bounds__(kThreads) place_queries(const Searc
 
 // ------------------------------------------------------------------------------------------------ solving
 // A query and the cell, or part of a cell, that may hold a root of it.
-template <class S> struct Pair {
+template <class S>
+struct Pair {
   int query, cell;
   S target[3];       // the query, posed, metres
   S cell_centre[3];  // canonical, metres
@@ -247,7 +260,8 @@ __device__ __forceinline__ bool solve(const Search<S>& a, const Grid<S>& grid, c
   return !a.orientation_preserving || preserves_orientation(inverse);
 }
 
-template <class S> __device__ bool holds(const Record<S>& part, const S* target) {
+template <class S>
+__device__ bool holds(const Record<S>& part, const S* target) {
   S offset[3];
   for (int i = 0; i < 3; ++i) offset[i] = target[i] - part.cell.c[kMonomials * i];
   return may_hold(part.bounds.box, part.bounds.inverse, part.bounds.reach, offset);
@@ -262,12 +276,14 @@ __device__ void solve_tame(const Search<S>& a, const Grid<S>& grid, const Pair<S
     report_root(a, pair.query, pair.cell, canonical, inverse);
 }
 
-template <class S> __device__ void eighth(int k, S* shift) {
+template <class S>
+__device__ void eighth(int k, S* shift) {
   for (int i = 0; i < 3; ++i) shift[i] = k >> i & 1 ? S(0.25) : S(-0.25);
 }
 
 // `level` is that of the part: a root may lie as far beyond its faces as beyond those of the cell.
-template <class S> __device__ void halve(const Cell<S>& whole, int k, int level, Record<S>& part) {
+template <class S>
+__device__ void halve(const Cell<S>& whole, int k, int level, Record<S>& part) {
   S shift[3];
   eighth(k, shift);
   halve_cell<S, S>(whole, shift, part.cell);
@@ -280,9 +296,9 @@ template <class S> __device__ void halve(const Cell<S>& whole, int k, int level,
 template <class S>
 __device__ void solve_curved(const Search<S>& a, const Grid<S>& grid, const Pair<S>& pair, const Record<S>& first, int k) {
   constexpr int kSeen = 8;
-  Cell<S> split[kLevels];         // the parts on the way down, by level; level 0, the cell, is not needed
-  S centre[kLevels + 1][3];       // their centres, cell coordinates
-  int following[kLevels];         // the next eighth of each
+  Cell<S> split[kLevels];    // the parts on the way down, by level; level 0, the cell, is not needed
+  S centre[kLevels + 1][3];  // their centres, cell coordinates
+  int following[kLevels];    // the next eighth of each
   S seen[kSeen][3], canonical[3], inverse[9];
   bool preserved[kSeen];
   int roots = 0, level = 1;
@@ -344,8 +360,10 @@ __device__ __forceinline__ int owner_of(const long long* sums, long long& n) {
   int first = 0, last = blockDim.x - 1;
   while (first < last) {
     const int middle = (first + last) / 2;
-    if (sums[middle] > n) last = middle;
-    else first = middle + 1;
+    if (sums[middle] > n)
+      last = middle;
+    else
+      first = middle + 1;
   }
   if (first) n -= sums[first - 1];
   return first;
@@ -429,8 +447,10 @@ __device__ __forceinline__ void search_chunk(const Search<S>& a, const Grid<S>& 
         pair.cell = a.first_cell + item_cell[owner];
         for (int i = 0; i < 3; ++i) pair.target[i] = a.sorted[3 * (long long)place + i];
         centre_of(grid, pair.cell, pair.cell_centre);
-        if (kCurved) solve_curved(a, grid, pair, parts[owner], int((chunk * threads + owner) % 8));
-        else solve_tame(a, grid, pair, records[item_cell[owner]]);
+        if (kCurved)
+          solve_curved(a, grid, pair, parts[owner], int((chunk * threads + owner) % 8));
+        else
+          solve_tame(a, grid, pair, records[item_cell[owner]]);
       }
       if (is_over) return;
       if (t == 0) queued = waiting - threads;
@@ -440,7 +460,8 @@ __device__ __forceinline__ void search_chunk(const Search<S>& a, const Grid<S>& 
 }
 
 // Searches all items of a pose, chunk by chunk; how many there are, only the device knows.
-template <class S, bool kCurved, int kMost> __device__ __forceinline__ void search_items(const Search<S>& a) {
+template <class S, bool kCurved, int kMost>
+__device__ __forceinline__ void search_items(const Search<S>& a) {
   __shared__ Bins<S> bins;
   const int listed = a.listed[2 * blockIdx.y + kCurved];
   const long long items = kCurved ? 8ll * listed : listed, chunks = (items + blockDim.x - 1) / blockDim.x;

@@ -12,7 +12,8 @@ namespace snarf {
 namespace SNARF_ISA {
 
 // By all numbers of a root: several starts may report one at the same place with inverses that differ in the last bits.
-template <class S> __device__ bool comes_before(const Search<S>& a, int one, int other) {
+template <class S>
+__device__ bool comes_before(const Search<S>& a, int one, int other) {
   if (a.root_order[one] != a.root_order[other]) return a.root_order[one] < a.root_order[other];
   const S* p = a.root + 12 * (long long)one;
   const S* q = a.root + 12 * (long long)other;
@@ -22,7 +23,8 @@ template <class S> __device__ bool comes_before(const Search<S>& a, int one, int
 }
 
 // The two roots beside a fold may be as close as two reports of one, but differ in orientation.
-template <class S> __device__ bool is_same(const Search<S>& a, int one, int other, S distance) {
+template <class S>
+__device__ bool is_same(const Search<S>& a, int one, int other, S distance) {
   const S* p = a.root + 12 * (long long)one;
   const S* q = a.root + 12 * (long long)other;
   return squared_distance(p, q) < distance * distance && preserves_orientation(p + 3) == preserves_orientation(q + 3);
@@ -52,8 +54,10 @@ extern "C" __global__ void __launch_bounds__(128) collect_roots(const Search<Num
       for (int before = *head; before != root + 1 && is_new; before = a.root_next[before - 1])
         is_new = !is_same(a, before - 1, root, distance);
       kept += is_new;
-      if (is_new) link = a.root_next + root;
-      else *link = a.root_next[root];
+      if (is_new)
+        link = a.root_next + root;
+      else
+        *link = a.root_next[root];
     }
   }
   a.kept[query] = kept;

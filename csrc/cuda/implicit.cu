@@ -12,7 +12,8 @@ namespace SNARF_ISA {
 
 typedef SNARF_NUMBER Number;
 
-template <class S> struct Backward {
+template <class S>
+struct Backward {
   const S* gradient;          // [M, 3], of the loss by the roots
   const S* canonical;         // [M, 3]
   const long long* query;     // [M], ascending
@@ -28,7 +29,8 @@ template <class S> struct Backward {
 };
 
 // node[0 .. 11] += weight * values[0 .. 11]
-template <class S> __device__ void add_to_node(S* node, S weight, const S* values) {
+template <class S>
+__device__ void add_to_node(S* node, S weight, const S* values) {
   for (int r = 0; r < 12; ++r) atomicAdd(node + r, weight * values[r]);
 }
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900

@@ -13,13 +13,15 @@ namespace SNARF_ISA {
 typedef SNARF_NUMBER Number;
 
 // Twelve numbers that move in 16-byte pieces: a blended transform, or a root with its inverse Jacobian.
-template <class S> struct alignas(16) Twelve {
+template <class S>
+struct alignas(16) Twelve {
   S v[12];
 };
 
 // A search handles the queries of all poses, and the cells of one group at a time (P poses, C cells of the grid, to bound the
 // memory). A query is known by its flat number b N + n, a root by its slot, in which order of time decides.
-template <class S> struct Search {
+template <class S>
+struct Search {
   // Given.
   const S* points;              // [B, N, 3], posed, metres
   const S* transforms;          // [B, V, 12], 16-byte aligned
@@ -28,44 +30,45 @@ template <class S> struct Search {
   const unsigned char* active;  // [all cells], or null
   const S* starts;              // [B, I, 12], posed to canonical (broyden)
   // Cells of the group.
-  S* records;                   // [P, C], Record
-  int* list;                    // [P, C]: numbers of the tame cells from the front, of the others from the back
-  int* listed;                  // [P, 2]: how many of either
-  unsigned* region;             // [P, 12]: ordered() bounds of the cells' boxes and of the queries: upper, -lower each
+  S* records;        // [P, C], Record
+  int* list;         // [P, C]: numbers of the tame cells from the front, of the others from the back
+  int* listed;       // [P, 2]: how many of either
+  unsigned* region;  // [P, 12]: ordered() bounds of the cells' boxes and of the queries: upper, -lower each
   // Queries of the group's poses, sorted into bins.
-  int* bin_count;               // [P, bins]
-  const int* bin_end;           // [P * bins]: running sum of bin_count
-  S* sorted;                    // [P * N, 3]
-  int* sorted_query;            // [P * N]
+  int* bin_count;      // [P, bins]
+  const int* bin_end;  // [P * bins]: running sum of bin_count
+  S* sorted;           // [P * N, 3]
+  int* sorted_query;   // [P * N]
   // Roots as they are found: a list for each query, linked by slot + 1, with 0 for its end.
-  S* root;                      // [slots, 12]: canonical [3], inverse Jacobian [9]
-  int* root_order;              // [slots]: cell or start, which sorts the roots of one query
-  int* root_next;               // [slots]
-  int* staged;                  // [1]: roots reported, may exceed `slots`
-  int* head;                    // [B * N]
-  int* kept;                    // [B * N]: roots of each query without duplicates
-  const int* end;               // [B * N]: running sum of `kept`
+  S* root;          // [slots, 12]: canonical [3], inverse Jacobian [9]
+  int* root_order;  // [slots]: cell or start, which sorts the roots of one query
+  int* root_next;   // [slots]
+  int* staged;      // [1]: roots reported, may exceed `slots`
+  int* head;        // [B * N]
+  int* kept;        // [B * N]: roots of each query without duplicates
+  const int* end;   // [B * N]: running sum of `kept`
   // Results.
-  S* canonical;                 // [capacity, 3]
-  long long* query;             // [capacity]
-  S* jacobian_inverse;          // [capacity, 9]
-  long long* found;             // [1]: may exceed `capacity`; null if not wanted
-  long long count;              // N
-  long long queries;            // B N
-  double tolerance, divergence; // as shares of the grid's longest side
-  double same_root;             // as a share of a cell's shortest side
-  int nodes[3];                 // W, H, D
-  int first_pose, first_cell;   // of the group
-  int cells;                    // C
-  int bins;                     // most bins of a pose
+  S* canonical;                  // [capacity, 3]
+  long long* query;              // [capacity]
+  S* jacobian_inverse;           // [capacity, 9]
+  long long* found;              // [1]: may exceed `capacity`; null if not wanted
+  long long count;               // N
+  long long queries;             // B N
+  double tolerance, divergence;  // as shares of the grid's longest side
+  double same_root;              // as a share of a cell's shortest side
+  int nodes[3];                  // W, H, D
+  int first_pose, first_cell;    // of the group
+  int cells;                     // C
+  int bins;                      // most bins of a pose
   int slots, capacity;
-  int start_count;              // I
+  int start_count;  // I
   int max_steps;
   int exact_jacobian;
   int orientation_preserving;
 };
 
-template <class S> SNARF_HD Grid<S> grid_of(const Search<S>& a) {
+template <class S>
+SNARF_HD Grid<S> grid_of(const Search<S>& a) {
   Grid<S> grid;
   for (int i = 0; i < 3; ++i) {
     grid.lower[i] = a.lower[i];
@@ -75,23 +78,30 @@ template <class S> SNARF_HD Grid<S> grid_of(const Search<S>& a) {
   return grid;
 }
 
-template <class S> SNARF_HD S longest_side(const Search<S>& a) {
+template <class S>
+SNARF_HD S longest_side(const Search<S>& a) {
   return larger(a.upper[0] - a.lower[0], larger(a.upper[1] - a.lower[1], a.upper[2] - a.lower[2]));
 }
 
-template <class S> SNARF_HD S same_root_distance(const Search<S>& a, const Grid<S>& grid) {
+template <class S>
+SNARF_HD S same_root_distance(const Search<S>& a, const Grid<S>& grid) {
   return S(a.same_root) * smaller(grid.size[0], smaller(grid.size[1], grid.size[2]));
 }
 
-template <class S> SNARF_HD bool is_finite(const S* p) { return p[0] - p[0] == 0 && p[1] - p[1] == 0 && p[2] - p[2] == 0; }
+template <class S>
+SNARF_HD bool is_finite(const S* p) {
+  return p[0] - p[0] == 0 && p[1] - p[1] == 0 && p[2] - p[2] == 0;
+}
 
-template <class S> SNARF_HD S squared_distance(const S* p, const S* q) {
+template <class S>
+SNARF_HD S squared_distance(const S* p, const S* q) {
   S sum = 0;
   for (int i = 0; i < 3; ++i) sum += (p[i] - q[i]) * (p[i] - q[i]);
   return sum;
 }
 
-template <class S> SNARF_HD bool preserves_orientation(const S* inverse) {
+template <class S>
+SNARF_HD bool preserves_orientation(const S* inverse) {
   S minors[9];
   return adjugate(inverse, minors) > 0;
 }

@@ -183,9 +183,7 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
     return rotation
 
 
-def pose_from_transforms(
-    posed_from_rest: Tensor, parents: Sequence[int], joints_rest: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def pose_from_transforms(posed_from_rest: Tensor, parents: Sequence[int], joints_rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Find the poses that move a joint tree as given bone transforms do: the way back from `forward_kinematics`.
 
     Args:

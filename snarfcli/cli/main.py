@@ -169,9 +169,9 @@ def _translate_flags(command: Command, arguments: list[str]) -> list[str]:
                 flags.append(rest.pop(0))
         elif argument.startswith("-"):
             valid = [*command.flags, "--help", *_HYDRA_FLAGS]
-            raise UserError(f"unknown flag {argument!r}{nearest(argument, valid)}; see \"snarf {command.name} --help\"")
+            raise UserError(f'unknown flag {argument!r}{nearest(argument, valid)}; see "snarf {command.name} --help"')
         elif not equals or argument.startswith("~"):
-            raise UserError(f"{argument!r} is no setting; write name=value; see \"snarf {command.name} --help\"")
+            raise UserError(f'{argument!r} is no setting; write name=value; see "snarf {command.name} --help"')
         else:
             written.add(name)
             out.append(f"{name}={quote_items(value)}" if name in command.lists_of_settings else argument)
@@ -208,7 +208,7 @@ def _overview() -> str:
         "snarf learns an animatable avatar of one subject from posed meshes.\n\n"
         f"usage: snarf COMMAND [FLAGS] [SETTING=VALUE ...]\n\n{rows}\n\n"
         "Work through the first four in this order; doctor says what this machine has. "
-        "\"snarf COMMAND --help\" tells more, \"snarf --version\" the version."
+        '"snarf COMMAND --help" tells more, "snarf --version" the version.'
     )
 
 

@@ -135,7 +135,6 @@ def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
     from hydra.core.global_hydra import GlobalHydra
     from omegaconf import OmegaConf
 
-
     check_overrides(overrides, TrainConfig, "train")
     presets = preset_groups(TrainConfig, "train")
     named = [override.partition("=") for override in overrides]

@@ -15,7 +15,7 @@ from snarfcli.datasets.skeleton_files import PoseFile
 from snarfcli.datasets.subjects import SequenceSpec, Split
 from snarfcli.motions import Motion
 
-__all__ = ["PERSON_M", "World", "Recording", "person_scale"]
+__all__ = ["PERSON_M", "Recording", "World", "person_scale"]
 
 PERSON_M = 1.8
 """Longest side that a subject is scaled to: the settings of training hold lengths that fit a person."""

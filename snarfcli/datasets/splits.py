@@ -37,5 +37,3 @@ def split_sequences(names: Sequence[str], test: Sequence[str], ood: Sequence[str
     if not set(names) - set(chosen):
         raise UserError(f"no sequence is left to train on: {', '.join(names)} are all held out; give fewer in data.test")
     return {name: chosen.get(name, "train") for name in names}
-
-

@@ -5,6 +5,8 @@ The papers give the weights (inverse distances to the bones) and the angles; siz
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -147,7 +149,7 @@ def _prisms(shapes: list[_Flat], num_joints: int) -> Template:
         vertices += [np.column_stack([level, np.full(len(level), z)]) for level, z in levels]
         rows = [outline, 2 * flat + np.arange(len(outline)), flat + outline]
         walls = []
-        for low, high in zip(rows[:-1], rows[1:], strict=True):
+        for low, high in itertools.pairwise(rows):
             a, b, c, d = low, np.roll(low, -1), np.roll(high, -1), high
             walls += [np.stack([a, b, c], -1), np.stack([a, c, d], -1)]
         faces.append(count + np.concatenate([triangles[:, ::-1], flat + triangles, *walls]))
@@ -178,9 +180,7 @@ def _training_angles(step_deg: int | None, generator: np.random.Generator) -> ND
     return np.concatenate([trained, _inside(max(1, round(len(trained) / 9)), generator)])
 
 
-def _sequence(
-    name: str, split: Split, angles: NDArray[np.float64], skeleton: Skeleton, template: Template
-) -> SequenceSpec:
+def _sequence(name: str, split: Split, angles: NDArray[np.float64], skeleton: Skeleton, template: Template) -> SequenceSpec:
     poses = np.zeros((len(angles), skeleton.num_joints, 3))
     poses[:, [_LOWER, _UPPER], 2] = np.deg2rad(angles)
     motion = Motion(name, poses, np.zeros((len(angles), 3)), _FRAME_RATE)

@@ -147,9 +147,7 @@ def find_correspondences(
         found = complete_search(points, transforms, *box, active_cells, tolerance, max_steps, *common)
     else:
         starts = _start_transforms(bone_transforms.detach(), init_bones)
-        found = broyden_search(
-            points, transforms, starts, *box, tolerance, divergence, max_steps, jacobian == "exact", *common
-        )
+        found = broyden_search(points, transforms, starts, *box, tolerance, divergence, max_steps, jacobian == "exact", *common)
     canonical, query, jacobian_inverse, total = found
     return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
 

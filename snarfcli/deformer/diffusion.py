@@ -104,8 +104,8 @@ def _near_surface(nodes: Tensor, vertices: Tensor, weights: Tensor) -> Tensor:
     count = min(_NEIGHBOURS, len(vertices))
     parts = []
     for some in nodes.split(_NODES_AT_ONCE):
-        squared, index = torch.cdist(some, vertices, compute_mode="donot_use_mm_for_euclid_dist").square().topk(
-            count, dim=1, largest=False
+        squared, index = (
+            torch.cdist(some, vertices, compute_mode="donot_use_mm_for_euclid_dist").square().topk(count, dim=1, largest=False)
         )
         beyond = squared - squared[:, :1]
         scale = beyond[:, min(3, count - 1), None].clamp_min(1e-12)

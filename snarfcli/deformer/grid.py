@@ -69,7 +69,7 @@ def cell_corners(cells: Tensor, shape: Sequence[int]) -> Tensor:
 
     Cells are numbered x fastest in a (D-1, H-1, W-1) array, nodes x fastest in `shape` = (D, H, W).
     """
-    depth, height, width = shape
+    _depth, height, width = shape
     x = cells % (width - 1)
     y = cells // (width - 1) % (height - 1)
     z = cells // ((width - 1) * (height - 1))

@@ -251,9 +251,7 @@ def _(points, transforms, lower, upper, shape, active_cells, tolerance, max_step
 
 
 @broyden_search.register_fake
-def _(
-    points, transforms, starts, lower, upper, shape, tolerance, divergence, max_steps, exact, preserving, capacity, backend
-):
+def _(points, transforms, starts, lower, upper, shape, tolerance, divergence, max_steps, exact, preserving, capacity, backend):
     return _fake_roots(points, capacity)
 
 

@@ -132,9 +132,7 @@ def draw_frame(
         log.warning("warning: nothing to draw for %s, frame %d: %s", sequence.name, sequence.frame_numbers[index], error)
         predicted = None
     pale = replace(truth, colors=np.full(truth.vertices.shape, _PALE, np.uint8))
-    pictures = [
-        None if mesh is None else render(mesh, camera, size, floor_y=floor_y) for mesh in (truth, predicted, pale)
-    ]
+    pictures = [None if mesh is None else render(mesh, camera, size, floor_y=floor_y) for mesh in (truth, predicted, pale)]
     points, occupied = sequence.points(index), sequence.occupancies(index)
     inside = predict_inside(avatar, sequence, index, points)
     missing, extra = occupied & ~inside, inside & ~occupied

@@ -133,7 +133,15 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
     total = {
         name: sum(getattr(frame, name) for frame in frames)
         for name in (
-            "points", "correspondences", "several", "without", "inside", "inside_without", "search_s", "shape_s", "total_s"
+            "points",
+            "correspondences",
+            "several",
+            "without",
+            "inside",
+            "inside_without",
+            "search_s",
+            "shape_s",
+            "total_s",
         )  # fmt: skip
     }
     return Summary(

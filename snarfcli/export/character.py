@@ -136,7 +136,7 @@ def check_avatar(avatar: TrainedField) -> None:
     if not avatar.has_skinning_weights:
         raise UserError(
             f"a rig needs skinning weights of canonical points, which model {avatar.config.model.name} does not have; "
-            "take an avatar of model=fast_snarf, or write single meshes with \"snarf animate\""
+            'take an avatar of model=fast_snarf, or write single meshes with "snarf animate"'
         )
 
 
@@ -178,7 +178,9 @@ def _decimated(mesh: Mesh, triangles: int) -> Mesh:
         raise UserError(str(error)) from None
 
 
-def build_character(avatar: TrainedField, surface: SkinnedSurface, clips: Sequence[Clip], options: CharacterOptions) -> Character:
+def build_character(
+    avatar: TrainedField, surface: SkinnedSurface, clips: Sequence[Clip], options: CharacterOptions
+) -> Character:
     """Make a character of an avatar in motion.
 
     Args:

@@ -22,9 +22,7 @@ _TRIAL_SHARE = 0.01
 _PART = 2000  # vertices at a time: with 128 poses they take 60 MB at most, however many joints there are
 
 
-def trial_poses(
-    skeleton: Skeleton, transforms: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def trial_poses(skeleton: Skeleton, transforms: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Add random poses to those of clips: what is fitted to standing still alone would fit no other motion.
 
     Args:

@@ -140,7 +140,7 @@ def on_ground(mesh: Mesh, skeleton: Skeleton, clip: Clip) -> tuple[Clip, float]:
         clip: what is moved, as a whole.
     """
     up = -lowest_point(mesh, skeleton, clip)
-    motion = replace(clip.motion, translation=clip.motion.translation + (0.0, up, 0.0))
+    motion = replace(clip.motion, translation=(*clip.motion.translation, 0.0, up, 0.0))
     transforms: NDArray | None = clip.bone_transforms
     if transforms is not None:
         transforms = np.array(transforms)

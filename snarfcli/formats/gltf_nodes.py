@@ -18,9 +18,7 @@ __all__ = ["NodeTree", "compose"]
 _MAX_NODES = 10_000
 
 
-def compose(
-    translation: NDArray[np.float64], rotation: NDArray[np.float64], scale: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def compose(translation: NDArray[np.float64], rotation: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return T @ R @ S [..., 4, 4] of translation [..., 3], unit quaternions [..., 4] (x, y, z, w) and scale [..., 3]."""
     shape = np.broadcast_shapes(translation.shape[:-1], rotation.shape[:-1], scale.shape[:-1])
     x, y, z, w = np.moveaxis(rotation, -1, 0)

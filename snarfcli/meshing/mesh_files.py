@@ -14,6 +14,7 @@ from snarfcli.meshing.mesh import Mesh
 
 __all__ = ["MESH_WRITERS", "read_mesh", "write_mesh", "write_obj", "write_ply"]
 
+
 def write_ply(path: str | Path, mesh: Mesh) -> None:
     """Write a mesh as binary little-endian PLY, with its normals and colours, whole or not at all."""
     columns: list[tuple[str, str, str, np.ndarray]] = []  # PLY type, name, numpy type, values

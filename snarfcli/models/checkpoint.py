@@ -20,7 +20,7 @@ def load_checkpoint(path: str | Path, file_format: str, version: int, what: str)
     """
     path = Path(path)
     if not path.is_file():
-        raise UserError(f"no {what} at {path}; train one with \"snarf train\" or name another file")
+        raise UserError(f'no {what} at {path}; train one with "snarf train" or name another file')
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except OSError:
@@ -28,7 +28,7 @@ def load_checkpoint(path: str | Path, file_format: str, version: int, what: str)
     except Exception:  # damaged bytes raise whatever the unpickler stumbles over: IndexError, UnicodeDecodeError, ...
         raise UserError(f"{what} {path} is truncated or is not a file of snarf; train it again or copy it again") from None
     if not isinstance(content, dict) or content.get("format") != file_format:
-        raise UserError(f"{path} is not a snarf {what}; give the file that \"snarf train\" wrote")
+        raise UserError(f'{path} is not a snarf {what}; give the file that "snarf train" wrote')
     if content.get("version") != version:
         came = content.get("version")
         raise UserError(f"{what} {path} has format version {came}, this snarf reads {version}; train it again")

@@ -74,9 +74,7 @@ class FastSnarf(System):
         self.register_buffer("_canonical_pose", skeleton.canonical_pose.float(), persistent=False)
         self._body_cells: Tensor | None = None
 
-    def forward(
-        self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
-    ) -> FieldSamples:
+    def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:
         """Evaluate the posed field: blended over the correspondences in training, their maximum otherwise.
 
         Args:
@@ -97,9 +95,7 @@ class FastSnarf(System):
         return FieldSamples(combined, counts > 0, counts, after_search - start, done - after_search)
 
     @torch.no_grad()
-    def occupied_cells(
-        self, pose: Tensor, threshold: float = 0.0, reach_m: float = 0.0, precision: str = "highest"
-    ) -> Tensor:
+    def occupied_cells(self, pose: Tensor, threshold: float = 0.0, reach_m: float = 0.0, precision: str = "highest") -> Tensor:
         """Return which cells the canonical shape touches in any of several poses, bool [D-1, H-1, W-1].
 
         The shape is looked at where cells are active: elsewhere the network was never trained.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from dataclasses import replace
@@ -59,9 +60,7 @@ class Nasa(PointwiseSystem):
     def _make_shape(self, bones: Tensor) -> nn.Module:
         return PartNetworks(self.config.model, self.num_bones)
 
-    def forward(
-        self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
-    ) -> FieldSamples:
+    def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:
         start = time.perf_counter()
         inverse, code = self._bone_frames(bone_transforms)
         after = self.time_s()
@@ -156,7 +155,7 @@ class PartNetworks(nn.Module):
                 f"got {width}, {depth} and {config.part_code}"
             )
         sizes = [3 + config.part_code] + [width] * depth + [1]
-        shapes = list(zip(sizes[:-1], sizes[1:], strict=True))
+        shapes = list(itertools.pairwise(sizes))
         # as nn.Linear starts
         self.weights = nn.ParameterList(_uniform((num_bones, a, b), a) for a, b in shapes)
         self.biases = nn.ParameterList(_uniform((num_bones, 1, b), a) for a, b in shapes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from typing import ClassVar
 
@@ -56,9 +57,7 @@ class PointwiseSystem(System):
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         """Make what the system has besides its shape; the arguments are those of the constructor."""
 
-    def forward(
-        self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
-    ) -> FieldSamples:
+    def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:
         start = time.perf_counter()
         with matmul_precision("highest"), torch.autocast(points.device.type, enabled=False):
             canonical, weights = self.canonical_points(points, bone_transforms, pose)
@@ -106,7 +105,7 @@ class PosedNetwork(nn.Module):
     def __init__(self, pose_size: int, outputs: int, config: AvatarConfig, scale: float, starts_at_zero: bool) -> None:
         super().__init__()
         sizes = [3 + pose_size] + [config.skinning.width] * config.skinning.depth + [outputs]
-        layers = [nn.Linear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+        layers = [nn.Linear(a, b) for a, b in itertools.pairwise(sizes)]
         if starts_at_zero:
             nn.init.normal_(layers[-1].weight, 0, 1e-4)
             nn.init.zeros_(layers[-1].bias)

@@ -14,9 +14,7 @@ from snarfcli.files import read_npz
 __all__ = ["read_preset_weights"]
 
 
-def read_preset_weights(
-    path: str | Path, grid: CanonicalGrid, shape: tuple[int, int, int], num_bones: int
-) -> PresetWeights:
+def read_preset_weights(path: str | Path, grid: CanonicalGrid, shape: tuple[int, int, int], num_bones: int) -> PresetWeights:
     """Read the skinning weights of a mesh and diffuse them into the grid.
 
     Args:
@@ -35,9 +33,7 @@ def read_preset_weights(
             raise UserError(f"weights file {path} must hold the arrays vertices and weights, got {came}")
         array = arrays[name]
         if array.ndim != 2 or array.shape[1] != last or array.dtype.kind not in "fiu":
-            raise UserError(
-                f"weights file {path}: {name} must be numbers [V, {last}], got {array.dtype} {list(array.shape)}"
-            )
+            raise UserError(f"weights file {path}: {name} must be numbers [V, {last}], got {array.dtype} {list(array.shape)}")
     vertices, weights = (torch.as_tensor(arrays[name].astype(np.float64)) for name in ("vertices", "weights"))
     try:
         return PresetWeights.from_vertices(vertices, weights, grid, shape)

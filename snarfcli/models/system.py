@@ -107,9 +107,7 @@ class System(nn.Module):
         return OccupancyNetwork(shape, pose_size, bones)
 
     # ---------------------------------------------------------------- the field
-    def forward(
-        self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
-    ) -> FieldSamples:
+    def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:
         """Evaluate the posed field.
 
         Args:

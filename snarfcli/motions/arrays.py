@@ -97,9 +97,7 @@ def motion_from_arrays(
     return Motion(name, poses, translation, frame_rate)
 
 
-def _values(
-    arrays: Mapping[str, NDArray], path: Path, wanted: str
-) -> tuple[NDArray[np.float64], tuple[str, ...], bool]:
+def _values(arrays: Mapping[str, NDArray], path: Path, wanted: str) -> tuple[NDArray[np.float64], tuple[str, ...], bool]:
     """Return poses [T, K, 3], the names of the K joints if the file says which they are, and whether it is AMASS's."""
     key = next((key for key in _POSES if key in arrays), None)
     if key is None:

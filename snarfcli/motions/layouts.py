@@ -43,9 +43,7 @@ def layout_of(skeleton: Skeleton) -> tuple[str, ...] | None:
     return layout
 
 
-def carry_over(
-    poses: NDArray[np.float64], names: tuple[str, ...], wanted: tuple[str, ...], hands: str
-) -> NDArray[np.float64]:
+def carry_over(poses: NDArray[np.float64], names: tuple[str, ...], wanted: tuple[str, ...], hands: str) -> NDArray[np.float64]:
     """Return poses [T, J, 3] of the joints `wanted` from poses [T, K, 3] of the joints `names`.
 
     Joints that both have keep their values; others stay straight, but for SMPL's hands with `hands="released"`.

@@ -56,9 +56,7 @@ def map_joints(
     return dict(sorted(pairs.items()))
 
 
-def _check_pairs(
-    pairs: dict[int, int], target: BodyParts, source: BodyParts, skeleton: Skeleton, rig: Rig, path: Path
-) -> None:
+def _check_pairs(pairs: dict[int, int], target: BodyParts, source: BodyParts, skeleton: Skeleton, rig: Rig, path: Path) -> None:
     """Refuse a file of which too little is understood: parts of a human body, or half the joints of another skeleton."""
     missing = [part for part in _REQUIRED if part in target.joints and part not in source.joints]
     is_human = all(part in target.joints for part in _REQUIRED)

@@ -105,9 +105,7 @@ def retarget(
     if up == "auto" and straightened is not rig and path.suffix.lower() in (".glb", ".gltf"):
         up = "y"  # whoever wrote it knows this skeleton, and so the format; a body that lies would mislead the guess
     rig = straightened
-    match = RestMatch(
-        pairs, parts.joints, parts.spine, joints_rest, rig.rest[:, :3, 3], skeleton.parents, rig.parents
-    )
+    match = RestMatch(pairs, parts.joints, parts.spine, joints_rest, rig.rest[:, :3, 3], skeleton.parents, rig.parents)
     if not np.isfinite(rig.rest).all():
         raise UserError(f"{path} holds NaN or infinity in its rest pose; export it again")
     turns = rest_turns(match)

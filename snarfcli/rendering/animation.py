@@ -238,9 +238,7 @@ def _colored(mesh: Mesh) -> Mesh:
     return mesh if mesh.weights is None else replace(mesh, colors=weights_to_colors(mesh.weights))
 
 
-def _made_elsewhere(
-    animation: Animation, processes: int, threads: int
-) -> Iterator[tuple[FrameRecord, np.ndarray | None]]:
+def _made_elsewhere(animation: Animation, processes: int, threads: int) -> Iterator[tuple[FrameRecord, np.ndarray | None]]:
     """Make the frames on several processes and yield them in order.
 
     Of P processes each makes every P-th frame. One that is ahead waits until its frame is asked for, so no more than two
@@ -297,9 +295,7 @@ def _end_all(workers: Sequence[Worker | Drawer]) -> None:
         ending.join()
 
 
-def _make_some(
-    animation: Animation, threads: int, numbers: Sequence[int]
-) -> Iterator[tuple[FrameRecord, np.ndarray | None]]:
+def _make_some(animation: Animation, threads: int, numbers: Sequence[int]) -> Iterator[tuple[FrameRecord, np.ndarray | None]]:
     """Make some frames in a worker process."""
     # Whoever started it ends it so; leaving in order takes a half-written file along.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))

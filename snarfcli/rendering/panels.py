@@ -57,9 +57,7 @@ class Screen:
         settled: contents that stay where they are, over x = z = 0, whatever the body does.
     """
 
-    def __init__(
-        self, stage: Stage, size: tuple[int, int], contents: Mapping[str, str], settled: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, stage: Stage, size: tuple[int, int], contents: Mapping[str, str], settled: Sequence[str] = ()) -> None:
         self.stage, self.size, self.contents, self.settled = stage, size, dict(contents), tuple(settled)
         self.columns, self.rows = _layout(len(self.contents), len(stage.views))
         self._backdrops: dict[tuple[int, bool], Backdrop] = {}

@@ -162,10 +162,7 @@ def draw_stick_shapes(plan: Plan, results: Sequence[Result], folder: Path) -> tu
         of_subject = [result for result in results if result.job.subject == subject and result.job.seed == plan.seeds[0]]
         trained = {result.job.row: result for result in of_subject if "train" in result.files}
         if trained:
-            avatars = {
-                row.label: _load(trained[row.key]) if row.key in trained else None
-                for row in plan.experiment.rows
-            }
+            avatars = {row.label: _load(trained[row.key]) if row.key in trained else None for row in plan.experiment.rows}
             rows += extreme_poses(_store(next(iter(trained.values())), "ood"), subject, avatars)
     if not rows:
         return None

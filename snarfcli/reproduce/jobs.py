@@ -234,5 +234,3 @@ def _reason(log: Path, begin: int, code: int) -> str:
         why = " (out of memory?)" if name == "SIGKILL" else ""
         return f"ended by {name}{why}"
     return last.removeprefix("snarf ").partition(": ")[2] if last.startswith("snarf ") else last or f"exit code {code}"
-
-

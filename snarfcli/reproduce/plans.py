@@ -258,9 +258,7 @@ def _job(row: Row, data: str, subject: str, seed: int, training: str, choice: Ch
         metrics = folder / f"eval_{split}{other}{part}" / "metrics.json"
         evaluations.append(Evaluation(split, set_name, root, arguments, str(metrics), settings))
     digest = _digest([resolved, seed, data, subject, row.inside_test])
-    return Job(
-        row.key, row.label, data, subject, seed, str(folder), tuple(samples.values()), train, tuple(evaluations), digest
-    )
+    return Job(row.key, row.label, data, subject, seed, str(folder), tuple(samples.values()), train, tuple(evaluations), digest)
 
 
 def _samples(data: str, subject: str, root: str, more: tuple[str, ...]) -> Samples:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 from collections.abc import Callable, Sequence
 
 from snarfcli.reproduce.experiments import Row
@@ -121,7 +122,7 @@ def order_lines(plan: Plan, results: Sequence[Result]) -> list[str]:
     rows = {row.key: row for row in plan.experiment.rows}
     ordered = [rows[key] for key in plan.experiment.order if key in rows]
     lines = []
-    for better, worse in zip(ordered, ordered[1:], strict=False):
+    for better, worse in itertools.pairwise(ordered):
         first, second = (summarise(_of(results, row, None), column) for row in (better, worse))
         pair = f"{better.label} over {worse.label}"
         if not _is_whole(first) or not _is_whole(second):

@@ -201,9 +201,7 @@ class SampleStore:
             self.template = Template(arrays["vertices_canonical"], arrays["faces"], arrays["vertex_weights"])
         self.betas: np.ndarray = arrays["betas"]
         """[S] float32 shape parameters of the body model; none without one."""
-        self._sequences = [
-            SequenceSamples(folder / entry["split"] / entry["name"], entry) for entry in manifest["sequences"]
-        ]
+        self._sequences = [SequenceSamples(folder / entry["split"] / entry["name"], entry) for entry in manifest["sequences"]]
 
     @classmethod
     def open(cls, root: str | Path, data: str, subject: str) -> SampleStore:

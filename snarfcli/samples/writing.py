@@ -76,7 +76,7 @@ class SequenceWriter:
             self._points, self._points_start = _start_array(self._partial / "points.npy", (*self._shape, 3), "<u2")
             packed = (num_frames, num_points // 8)
             self._occupancies, self._bits_start = _start_array(self._partial / "occupancies.npy", packed, "|u1")
-            self._spool = open(self._partial / _SPOOL, "w+b")  # noqa: SIM115  closed by finish or discard
+            self._spool = open(self._partial / _SPOOL, "w+b")
         except BaseException:
             self.discard()
             raise
@@ -168,7 +168,7 @@ class SequenceWriter:
 
 def _start_array(path: Path, shape: tuple[int, ...], dtype: str) -> tuple[Any, int]:
     """Open a `.npy` file to be filled in, and return it with the position of its first value."""
-    file = open(path, "wb")  # noqa: SIM115  closed by the writer
+    file = open(path, "wb")
     try:
         header = {"descr": dtype, "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)

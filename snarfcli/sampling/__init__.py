@@ -50,7 +50,7 @@ __all__ = [
     "sample_frames",
     "sampling_cube",
     "surface_samples",
-    "unpack_vertices",
     "uniform_surface_samples",
+    "unpack_vertices",
     "winding_numbers",
 ]

@@ -78,9 +78,7 @@ def in_turned_over(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) 
     flat = points[:, :2].astype(np.float64)
     near = np.flatnonzero(((flat >= turned.min((0, 1))) & (flat <= turned.max((0, 1)))).all(1))
     for part in np.array_split(near, 1 + len(near) * len(turned) // _PAIRS_AT_ONCE):
-        sides = [
-            _cross(turned[:, (k + 1) % 3] - turned[:, k], flat[part, None] - turned[:, k]) <= 0 for k in range(3)
-        ]
+        sides = [_cross(turned[:, (k + 1) % 3] - turned[:, k], flat[part, None] - turned[:, k]) <= 0 for k in range(3)]
         inside[part] = np.logical_and.reduce(sides).any(1)
     return inside
 

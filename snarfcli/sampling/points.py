@@ -251,9 +251,7 @@ def _triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
     return corners, areas
 
 
-def _uniform_in_triangles(
-    corners: np.ndarray, areas: np.ndarray, count: int, generator: np.random.Generator
-) -> np.ndarray:
+def _uniform_in_triangles(corners: np.ndarray, areas: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
     """Return `count` points [count, 3], uniform on triangles."""
     chosen = generator.choice(len(areas), count, p=areas / areas.sum())
     first, second = generator.random((2, count, 1))

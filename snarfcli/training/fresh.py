@@ -73,9 +73,7 @@ class FreshPoints:
         drawn = [self._draw_frame(self.sequences[sequence], frame, random) for sequence, frame in frames]
         return DrawnPoints(frames, np.stack([points for points, _ in drawn]), np.stack([inside for _, inside in drawn]))
 
-    def _draw_frame(
-        self, sequence: SequenceSamples, frame: int, random: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _draw_frame(self, sequence: SequenceSamples, frame: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Return points [N, 3] of one frame, and which are inside [N]."""
         vertices, faces = sequence.vertices(frame), sequence.faces(frame)
         lower, upper = sequence.cube(frame)

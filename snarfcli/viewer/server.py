@@ -124,7 +124,7 @@ class ViewServer:
     ) -> None:
         require_viser()
         check_port(host, port)
-        import viser
+        import viser  # noqa: F401
 
         self._woken = threading.Event()
         self._is_stopped = False

@@ -36,9 +36,7 @@ class Viewing:
         clock: seconds.
     """
 
-    def __init__(
-        self, body: Body, look: Look, wake: Callable[[], None], clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, body: Body, look: Look, wake: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> None:
         self.body = body
         self.look = look if body.has_weights else replace(look, surface="field", weight_colors=False, shows_canonical=False)
         self.player = Player()
@@ -225,7 +223,7 @@ class Viewing:
     def _stand(self) -> None:
         """Put the body onto the floor by its height."""
         low = self._made.lowest(self._posed.transforms)
-        translation = self._posed.translation + (0.0, self.floor_y - low, 0.0)
+        translation = (*self._posed.translation, 0.0, self.floor_y - low, 0.0)
         self._take(self._posed.pose, translation)
 
     def _find_floor(self) -> None:

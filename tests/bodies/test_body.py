@@ -82,7 +82,7 @@ def test_gradients_reach_pose_and_shape(body):
     pose = torch.zeros(1, 24, 3, dtype=torch.float64, requires_grad=True)
     betas = torch.zeros(10, dtype=torch.float64, requires_grad=True)
     weight = torch.randn(6890, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    loss = lambda p, b: (body.pose(p, b).vertices * weight).sum()  # noqa: E731
+    loss = lambda p, b: (body.pose(p, b).vertices * weight).sum()
     loss(pose, betas).backward()
     for tensor, index in ((pose, (0, 18, 1)), (pose, (0, 0, 2)), (betas, (0,))):
         step = torch.zeros_like(tensor)
@@ -95,14 +95,17 @@ def test_gradients_reach_pose_and_shape(body):
 def test_builtin_body_is_sound(body):
     edges = torch.cat([body.faces[:, [0, 1]], body.faces[:, [1, 2]], body.faces[:, [2, 0]]]).tolist()
     directed = {tuple(edge) for edge in edges}
-    assert len(directed) == len(edges) and all((b, a) in directed for a, b in directed)  # closed, consistently wound
+    assert len(directed) == len(edges)
+    assert all((b, a) in directed for a, b in directed)
     triangles = body.v_template[body.faces]
     assert torch.linalg.det(triangles).sum() / 6 > 0.05  # volume in cubic metres: outward
     torch.testing.assert_close(body.weights.sum(1), torch.ones(6890, dtype=torch.float64), atol=1e-6, rtol=0)
-    assert body.num_joints == 24 and body.num_betas == 10
+    assert body.num_joints == 24
+    assert body.num_betas == 10
     height = np.ptp(body.v_template[:, 1].numpy())
     assert 1.5 < height < 1.9
-    assert body.joint_names[4] == "l_knee" and body.shaped()[1][4, 0] > 0
+    assert body.joint_names[4] == "l_knee"
+    assert body.shaped()[1][4, 0] > 0
     assert body.to(torch.float32).v_template.dtype == torch.float32
     assert body.to(torch.float32).faces.dtype == torch.int64
 

@@ -91,7 +91,8 @@ def test_forward_kinematics_takes_joints_per_frame_and_empty_batches():
     each = forward_kinematics(pose, rest.expand(4, -1, -1), PARENTS)
     torch.testing.assert_close(shared, each)
     joints, transforms = forward_kinematics(pose[:0], rest, PARENTS)
-    assert joints.shape == (0, 6, 3) and transforms.shape == (0, 6, 4, 4)
+    assert joints.shape == (0, 6, 3)
+    assert transforms.shape == (0, 6, 4, 4)
 
 
 def test_forward_kinematics_gradient():

@@ -39,7 +39,8 @@ def test_smpl_is_the_same_from_every_file(tmp_path):
         assert body.joint_names[4] == "l_knee" and body.num_betas == (300 if "1.1" in path.name else 10), name
         assert all(tensor.is_contiguous() for tensor in (body.weights, body.shapedirs, body.posedirs, body.v_template))
     few = load_body(files["v1.1.0"], num_betas=16)
-    assert few.num_betas == 16 and few.v_template.dtype == torch.float32
+    assert few.num_betas == 16
+    assert few.v_template.dtype == torch.float32
     assert few.shapedirs.untyped_storage().nbytes() == 4 * 6890 * 3 * 16
     # float32: metres, 24 transforms chained nine deep
     torch.testing.assert_close(posed(few).double(), expected, atol=3e-6, rtol=0)
@@ -57,7 +58,8 @@ def test_files_of_python_2_with_chumpy(protocol, tmp_path):
     }
     body = load_body(GOLDEN / f"python2_body_{protocol}.pkl", dtype=torch.float64)
     expected = load_body(write_npz(tmp_path / "body.npz", arrays), dtype=torch.float64)
-    assert torch.equal(posed(body), posed(expected)) and torch.equal(body.faces, expected.faces)
+    assert torch.equal(posed(body), posed(expected))
+    assert torch.equal(body.faces, expected.faces)
 
 
 @pytest.mark.parametrize(
@@ -67,18 +69,23 @@ def test_files_of_python_2_with_chumpy(protocol, tmp_path):
 def test_other_skeletons(joints, stored, shapes, tmp_path):
     arrays = toy(joints, stored)
     body = load_body(write_pickle(tmp_path / "body.pkl", arrays, selected=3), dtype=torch.float64)
-    assert body.num_joints == joints and body.num_betas == shapes
+    assert body.num_joints == joints
+    assert body.num_betas == shapes
     np.testing.assert_array_equal(body.shapedirs, arrays["shapedirs"][..., :shapes])
     assert torch.equal(posed(body), posed(load_body(write_npz(tmp_path / "body.npz", arrays), dtype=torch.float64)))
     names = body.joint_names
     assert len(set(names)) == joints
     if joints == 52:
-        assert names[22] == "l_index1" and names[37] == "r_index1" and names[51] == "r_thumb3"
+        assert names[22] == "l_index1"
+        assert names[37] == "r_index1"
+        assert names[51] == "r_thumb3"
     if joints == 55:
-        assert names[22:26] == ("jaw", "l_eye", "r_eye", "l_index1") and names[54] == "r_thumb3"
+        assert names[22:26] == ("jaw", "l_eye", "r_eye", "l_index1")
+        assert names[54] == "r_thumb3"
     if joints in (52, 55):
         sides = body.skeleton().left_right
-        assert [sides[sides[joint]] for joint in range(joints)] == list(range(joints)) and sides[21] == 20
+        assert [sides[sides[joint]] for joint in range(joints)] == list(range(joints))
+        assert sides[21] == 20
         assert sum(joint == other for joint, other in enumerate(sides)) == (6 if joints == 52 else 7)
         assert body.skeleton().canonical_pose[1, 2] > 0
 
@@ -108,7 +115,8 @@ def test_layouts_of_the_pose_correctives(tmp_path):
 
 def test_bending_two_bones(tmp_path):
     body = load_body(write_npz(tmp_path / "body.npz", octahedron()), dtype=torch.float64)
-    assert body.parents == (-1, 0) and body.joint_names == ("joint_0", "joint_1")
+    assert body.parents == (-1, 0)
+    assert body.joint_names == ("joint_0", "joint_1")
     bent = body.pose(torch.tensor([[[0.0, 0, 0], [0, 0, np.pi / 2]]])).vertices[0]
     torch.testing.assert_close(bent[2], torch.tensor([-1.0, 0, 0], dtype=torch.float64))  # +y turns to -x
     torch.testing.assert_close(bent[3], torch.tensor([0.0, -1, 0], dtype=torch.float64))
@@ -190,7 +198,8 @@ def test_broken_files(tmp_path, change, message):
     for path in (write_npz(tmp_path / "body.npz", arrays), write_pickle(tmp_path / "body.pkl", arrays, chumpy=chumpy)):
         with pytest.raises(UserError, match=message) as caught:
             load_body(path)
-        assert str(caught.value).startswith(f"body {path}") and str(caught.value).isprintable()
+        assert str(caught.value).startswith(f"body {path}")
+        assert str(caught.value).isprintable()
 
 
 def test_a_cycle_of_joints(tmp_path):
@@ -223,7 +232,7 @@ def test_missing_and_foreign_files(tmp_path):
     with pytest.raises(UserError, match=r"is neither an .npz nor a .pkl file"):
         load_body(tmp_path / "body.obj")
     (tmp_path / "evil.pkl").write_bytes(pickled(octahedron()).replace(b"cchumpy.ch\nCh\n", b"cposix\nsystem\n"))
-    with pytest.raises(UserError, match="asks for posix.system, which no plain data needs"):
+    with pytest.raises(UserError, match=r"asks for posix.system, which no plain data needs"):
         load_body(tmp_path / "evil.pkl")
     with pytest.raises(ValueError, match="num_betas: wanted at least 0"):
         load_body(tmp_path / "evil.pkl", num_betas=-1)

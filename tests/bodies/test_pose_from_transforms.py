@@ -27,7 +27,9 @@ def scene(dtype=torch.float64, frames=5):
 def test_poses_come_back(dtype, tolerance):
     poses, rest, translation, transforms = scene(dtype)
     back, moved, residual = pose_from_transforms(transforms, PARENTS, rest)
-    assert back.dtype == dtype and residual.shape == (5,) and residual.max() < tolerance
+    assert back.dtype == dtype
+    assert residual.shape == (5,)
+    assert residual.max() < tolerance
     for mine, given in zip(back.reshape(-1, 3).numpy(), poses.reshape(-1, 3).numpy(), strict=True):
         difference = Rotation.from_rotvec(mine).inv() * Rotation.from_rotvec(given)
         assert difference.magnitude() < tolerance
@@ -37,18 +39,18 @@ def test_poses_come_back(dtype, tolerance):
 def test_poses_of_the_built_in_body_come_back():
     skeleton = builtin_body(torch.float64).skeleton()
     poses = 0.4 * torch.randn(3, 24, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    back, translation, residual = pose_from_transforms(
-        skeleton.posed_from_rest(poses), skeleton.parents, skeleton.joints_rest
-    )
+    back, translation, residual = pose_from_transforms(skeleton.posed_from_rest(poses), skeleton.parents, skeleton.joints_rest)
     torch.testing.assert_close(back, poses, atol=1e-12, rtol=0)
-    assert translation.abs().max() < 1e-12 and residual.max() < 1e-12
+    assert translation.abs().max() < 1e-12
+    assert residual.max() < 1e-12
 
 
 def test_a_joint_that_comes_apart_is_in_the_residual():
     _, rest, _, transforms = scene()
     transforms[2, 4, 1, 3] += 0.03
     residual = pose_from_transforms(transforms, PARENTS, rest)[2]
-    assert residual[2].item() == pytest.approx(0.03) and residual[[0, 1, 3, 4]].max() < 1e-12
+    assert residual[2].item() == pytest.approx(0.03)
+    assert residual[[0, 1, 3, 4]].max() < 1e-12
 
 
 def test_scale_is_left_out_of_the_poses_and_is_in_the_residual():
@@ -66,7 +68,9 @@ def test_a_reflection_gives_a_rotation_and_a_residual():
     _, rest, _, transforms = scene()
     transforms[0, 5, :3, 0] *= -1
     back, _, residual = pose_from_transforms(transforms, PARENTS, rest)
-    assert back.isfinite().all() and residual[0] > 0.05 and residual[1:].max() < 1e-12
+    assert back.isfinite().all()
+    assert residual[0] > 0.05
+    assert residual[1:].max() < 1e-12
 
 
 def test_nearest_rotation():

@@ -16,7 +16,8 @@ def skeleton():
 def test_canonical_legs_are_apart(skeleton):
     joints = skeleton.canonical_joints
     left, right = (joints[skeleton.names.index(name)] for name in ("l_ankle", "r_ankle"))
-    assert left[0] > 0.5 and right[0] < -0.5  # at rest they stand 0.36 m apart
+    assert left[0] > 0.5
+    assert right[0] < -0.5
     assert skeleton.canonical_pose.count_nonzero() == 2
     arms = [SMPL_JOINT_NAMES.index(name) for name in ("l_wrist", "r_wrist")]
     torch.testing.assert_close(joints[arms], skeleton.joints_rest[arms])
@@ -41,7 +42,8 @@ def test_transforms_move_canonical_joints_to_posed_joints(skeleton):
 
 def test_sides_and_bones(skeleton):
     assert skeleton.num_joints == 24
-    assert len(skeleton.bones) == 23 and skeleton.bones[0] == (0, 1)
+    assert len(skeleton.bones) == 23
+    assert skeleton.bones[0] == (0, 1)
     for joint, other in enumerate(skeleton.left_right):
         assert skeleton.left_right[other] == joint
         assert skeleton.names[joint][:2] != "l_" or skeleton.names[other] == "r_" + skeleton.names[joint][2:]
@@ -51,8 +53,10 @@ def test_sides_and_bones(skeleton):
 def test_survives_a_safe_checkpoint(skeleton, tmp_path):
     torch.save({"skeleton": skeleton.to_dict()}, tmp_path / "a.pt")
     back = Skeleton.from_dict(torch.load(tmp_path / "a.pt", weights_only=True)["skeleton"])
-    assert back.names == skeleton.names and back.parents == skeleton.parents
-    assert torch.equal(back.joints_rest, skeleton.joints_rest) and torch.equal(back.canonical_pose, skeleton.canonical_pose)
+    assert back.names == skeleton.names
+    assert back.parents == skeleton.parents
+    assert torch.equal(back.joints_rest, skeleton.joints_rest)
+    assert torch.equal(back.canonical_pose, skeleton.canonical_pose)
     assert isinstance(back.parents[0], int)
 
 

@@ -39,7 +39,8 @@ def test_help_shows_purpose_example_choices_and_every_setting(capsys, name):
     code, out, _ = run(capsys, name, "--help")
     command = cli.COMMANDS[name]
     assert code == 0
-    assert command.summary in out and command.example in out
+    assert command.summary in out
+    assert command.example in out
     import importlib
 
     schema = getattr(importlib.import_module(f"snarfcli.commands.{command.module}"), command.schema)
@@ -81,7 +82,7 @@ WRONG = {
     ("train", "search.jacobian=exat"): "search.jacobian must be exact or broyden, got 'exat'; did you mean 'exact'?",
     ("eval", "search=null"): "there is no search=null; choose from broyden, complete, snarf, or leave it out",
     ("train", "50002"): "'50002' is no setting; write name=value",
-    ("train", "subject='unclosed"): "cannot read \"subject='unclosed\"",
+    ("train", "subject='unclosed"): 'cannot read "subject=\'unclosed"',
     ("train", "device=gpu"): "device must be auto, cpu, cuda or cuda:N, got 'gpu'",
     ("train", "device=cuda:7"): "device cuda:7 is not there",
     ("train", "threads=0", "data_root=none"): "threads must be at least 1, got 0",
@@ -100,7 +101,8 @@ def test_a_user_error_is_one_line_with_code_2(capsys, elsewhere, arguments):
     code, out, err = run(capsys, *arguments)
     assert code == 2
     assert WRONG[arguments] in err
-    assert len(err.strip().splitlines()) == 1 and "Traceback" not in out + err
+    assert len(err.strip().splitlines()) == 1
+    assert "Traceback" not in out + err
     assert not list(elsewhere.iterdir()), "something was left behind"
 
 
@@ -123,9 +125,11 @@ def test_overrides_and_flags_keep_their_order():
 
 def test_flags_of_hydra_may_stand_anywhere(capsys):
     code, out, _ = run(capsys, "train", "--cfg", "job", "subject=7", "--package", "training", "training=smoke")
-    assert code == 0 and "name: smoke" in out
+    assert code == 0
+    assert "name: smoke" in out
     code, _, err = run(capsys, "preprocess", "-m", "subject=1,2", "workers=1")
-    assert code == 2 and "no built-in subject '1'" in err
+    assert code == 2
+    assert "no built-in subject '1'" in err
 
 
 def test_unwritable_and_full_folders_are_named():
@@ -149,7 +153,8 @@ def test_user_error_inside_another_error_is_found():
 def test_interrupt_is_130(capsys, monkeypatch):
     monkeypatch.setattr(cli, "_run", lambda command, arguments: (_ for _ in ()).throw(KeyboardInterrupt))
     code, _, err = run(capsys, "train")
-    assert code == 130 and err.strip() == "snarf train: interrupted"
+    assert code == 130
+    assert err.strip() == "snarf train: interrupted"
 
 
 def test_setting_names_are_dotted():
@@ -162,11 +167,14 @@ def test_setting_names_are_dotted():
 def test_a_list_needs_no_brackets(capsys):
     for value, wanted in (("front", ["front"]), ("front,left", ["front", "left"]), ("[back]", ["back"])):
         code, out, _ = run(capsys, "animate", f"views={value}", "--cfg", "job")
-        assert code == 0 and "views:\n" + "".join(f"- {name}\n" for name in wanted) in out
+        assert code == 0
+        assert "views:\n" + "".join(f"- {name}\n" for name in wanted) in out
     code, out, _ = run(capsys, "reproduce", "table1", "subjects=50002,50004", "--cfg", "job")
-    assert code == 0 and "subjects:\n- '50002'\n- '50004'\n" in out
+    assert code == 0
+    assert "subjects:\n- '50002'\n- '50004'\n" in out
 
 
 def test_one_value_given_as_a_list_is_told_how_to_write_it(capsys):
     code, _, error = run(capsys, "animate", "motion=[lunges,splits]")
-    assert code == 2 and error == "snarf animate: motion takes one value, got a list; write motion=lunges\n"
+    assert code == 2
+    assert error == "snarf animate: motion takes one value, got a list; write motion=lunges\n"

@@ -115,16 +115,20 @@ def test_meshes_video_and_record(config, toy):
     assert sorted(path.name for path in folder.iterdir()) == ["animation.json", *names, "poster.png", "video.mp4"]
     solids = [trimesh.load(folder / name, process=False) for name in names]
     for solid in solids:
-        assert solid.is_watertight and solid.volume == pytest.approx(VOLUME, rel=0.15)  # bends lose volume
+        assert solid.is_watertight
+        assert solid.volume == pytest.approx(VOLUME, rel=0.15)
     # translation and global orientation are kept: the root end of the capsules travels with trans
     assert solids[-1].bounds[0, 0] - solids[0].bounds[0, 0] == pytest.approx(0.5, abs=0.05)
     assert solids[0].bounds[0, 1] == pytest.approx(0.9 - RADIUS, abs=0.02)
     assert solids[0].vertices[:, 2].min() < -0.2
     facts, frames = video_frames(folder / "video.mp4")
-    assert facts["size"] == (80, 64) and facts["fps"] == pytest.approx(24) and len(frames) == 6
+    assert facts["size"] == (80, 64)
+    assert facts["fps"] == pytest.approx(24)
+    assert len(frames) == 6
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1  # it moves
     record = record_of(config)
-    assert record["complete"] and record["skipped"] == []
+    assert record["complete"]
+    assert record["skipped"] == []
     assert [frame["file"] for frame in record["frames"]] == names
     assert all(frame["components"] == 1 and frame["points"] > 0 for frame in record["frames"])
     assert record["motion"] == {"name": "wave", "frames": 6, "frame_rate": 24.0}
@@ -136,7 +140,8 @@ def test_frame_range_step_and_pace(config):
     assert sorted(path.name for path in folder.glob("frame_*")) == ["frame_000000.obj", "frame_000001.obj"]
     assert [frame["frame"] for frame in record_of(config)["frames"]] == [1, 3]
     facts, frames = video_frames(folder / "video.mp4")
-    assert facts["fps"] == pytest.approx(12) and len(frames) == 2
+    assert facts["fps"] == pytest.approx(12)
+    assert len(frames) == 2
 
 
 @pytest.mark.parametrize("surface", ["field", "skinned"])
@@ -156,7 +161,8 @@ def test_views_and_contents_side_by_side(config):
     assert run(replace(config, max_frames=3, views=["front", "top"], beside=beside, video_size="48x40", turntable="90")) == 0
     facts, frames = video_frames(folder_of(config) / "video.mp4")
     poster = np.asarray(Image.open(folder_of(config) / "poster.png")).astype(int)
-    assert facts["size"] == (2 * 48 + 2, poster.shape[0] + poster.shape[0] % 2) and len(frames) == 3  # even, as codecs wish
+    assert facts["size"] == (2 * 48 + 2, poster.shape[0] + poster.shape[0] % 2)
+    assert len(frames) == 3
     assert np.abs(frames[1][: poster.shape[0], : poster.shape[1]] - poster).mean() < 6  # the middle of the video
     strip = poster.shape[0] // 4 - 40
     panels = [[poster[row * (40 + strip) :][:40, column * 49 :][:, :48] for column in range(2)] for row in range(4)]
@@ -184,7 +190,8 @@ def test_what_is_missing_beside_is_no_missing_frame(config, toy, monkeypatch, ca
     monkeypatch.setattr(SkinnedSurface, "posed", posed)
     assert run(replace(config, max_frames=2, beside=["skinned"])) == 1
     record = record_of(config)
-    assert record["skipped"] == [] and [frame["file"] for frame in record["frames"]] == ["frame_000000.ply", "frame_000001.ply"]
+    assert record["skipped"] == []
+    assert [frame["file"] for frame in record["frames"]] == ["frame_000000.ply", "frame_000001.ply"]
     assert [entry["reason"] for entry in record["missing"]] == ["skinned surface: nothing there"] * 2
     assert "2 of 2 frames lack something beside the avatar" in caplog.text
 
@@ -194,13 +201,14 @@ def test_truth_is_shown_where_there_is_some(config, toy, tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"beside=\[truth\]: there is no ground truth of pose files for data=meshes"):
         run(replace(config, beside=["truth"]))
     solid = trimesh.creation.box((0.4, 0.2, 0.2))
-    meshes = [(solid.vertices + (2 * frame, 1, 0), solid.faces) for frame in range(6)]
+    meshes = [((*solid.vertices, 2 * frame, 1, 0), solid.faces) for frame in range(6)]
     monkeypatch.setattr(animate, "true_meshes", lambda *arguments: meshes)
     assert run(replace(config, beside=["truth"], max_frames=2, output=str(tmp_path / "out"))) == 0
     _, frames = video_frames(tmp_path / "out" / "video.mp4")
     is_clay = [frame[:64, 65:].astype(int) @ (1, 0, -1) > 30 for frame in frames]
     middle = [np.nonzero(panel)[1].mean() for panel in is_clay]
-    assert middle[1] > middle[0] + 20 and not is_clay[1][:, -1].any()  # it walks off, and stays in the picture
+    assert middle[1] > middle[0] + 20
+    assert not is_clay[1][:, -1].any()
 
 
 def test_an_interrupted_run_goes_on(config, toy, monkeypatch, caplog):
@@ -257,13 +265,14 @@ def test_files_of_others_are_not_deleted(config, tmp_path):
     mine.parent.mkdir()
     mine.write_text("not by this program")
     short = replace(config, max_frames=1, video=False, output=str(mine.parent))
-    with pytest.raises(UserError, match="holds frame_0001.ply of unknown origin; give overwrite=true"):
+    with pytest.raises(UserError, match=r"holds frame_0001.ply of unknown origin; give overwrite=true"):
         run(short)
     assert mine.exists()
     (mine.parent / "animation.json").write_text("[]")
     with pytest.raises(UserError, match="is no record of an animation"):
         run(short)
-    assert run(replace(short, overwrite=True)) == 0 and not mine.exists()
+    assert run(replace(short, overwrite=True)) == 0
+    assert not mine.exists()
 
 
 def test_a_frame_without_surface_is_reported_and_the_rest_goes_on(config, toy, monkeypatch, caplog):
@@ -354,7 +363,8 @@ def test_a_bvh_of_the_avatars_own_joints(config, tmp_path):
     assert run(replace(config, pose=str(path), video=False, output=str(tmp_path / "out"))) == 0
     bounds = [trimesh.load(tmp_path / "out" / f"frame_{frame:06d}.ply", process=False).bounds for frame in range(2)]
     assert bounds[0][1, 0] == pytest.approx(2 * LENGTH + RADIUS, abs=0.05)
-    assert bounds[1][1, 2] == pytest.approx(2 + RADIUS, abs=0.05) and bounds[1][0, 2] < 2 - 0.25  # bent back about the vertical
+    assert bounds[1][1, 2] == pytest.approx(2 + RADIUS, abs=0.05)
+    assert bounds[1][0, 2] < 2 - 0.25
 
 
 def test_the_command_line(config, pose_file, capsys):

@@ -37,7 +37,9 @@ def test_everything_is_told(caplog, tmp_path):
     assert lines["torch"] == torch.__version__
     assert lines["threads"].startswith(f"{torch.get_num_threads()} ")
     assert lines["native library"].startswith(f"active, {library.instruction_set()}, {library.library_path()}")
-    assert "no folder" in lines["data_root"] and "snarf preprocess" in lines["samples"] and "snarf train" in lines["avatars"]
+    assert "no folder" in lines["data_root"]
+    assert "snarf preprocess" in lines["samples"]
+    assert "snarf train" in lines["avatars"]
     others = {"snarf", "python", "platform", "numpy", "model", "devices", "CUDA kernels", "ffmpeg", "embree", "libigl"}
     assert others <= set(lines)
 
@@ -48,7 +50,8 @@ def test_data_and_avatars_are_found(caplog, tmp_path):
         (tmp_path / file).touch()
     lines = report(caplog, tmp_path / "data", tmp_path / "outputs")
     assert lines["data_root"].endswith("folders: dfaust")
-    assert lines["samples"] == "builtin/50002" and lines["avatars"] == "builtin/50002/demo"
+    assert lines["samples"] == "builtin/50002"
+    assert lines["avatars"] == "builtin/50002/demo"
 
 
 def test_a_fallback_is_named_with_its_reason(caplog, tmp_path, broken_library):
@@ -66,14 +69,17 @@ def test_a_broken_section_does_not_end_the_report(caplog, tmp_path, monkeypatch)
     monkeypatch.setattr(doctor, "_native", lambda: 1 / 0)
     lines = report(caplog, tmp_path, tmp_path)
     assert lines["error"] == "ZeroDivisionError: division by zero"
-    assert "libigl" in lines and "error" in lines["end"]
+    assert "libigl" in lines
+    assert "error" in lines["end"]
 
 
 def test_it_runs_without_pytorch(tmp_path):
     code = "import sys; sys.modules['torch'] = None; from snarfcli.cli.main import main; raise SystemExit(main(['doctor']))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "cannot be imported" in done.stdout and "libigl" in done.stdout and "Traceback" not in done.stdout + done.stderr
+    assert "cannot be imported" in done.stdout
+    assert "libigl" in done.stdout
+    assert "Traceback" not in done.stdout + done.stderr
 
 
 def test_as_a_command(capsys, tmp_path, monkeypatch):

@@ -142,7 +142,7 @@ def test_no_avatar_names_the_command_that_makes_one(config):
 
 def test_no_samples_name_the_command_that_makes_them(config, tmp_path):
     avatar = str(folder_of(config) / "avatar.pt")
-    with pytest.raises(UserError, match="no samples of subject 50002 .*snarf preprocess"):
+    with pytest.raises(UserError, match=r"no samples of subject 50002 .*snarf preprocess"):
         run(replace(config, data_root=str(tmp_path / "nothing"), subject="50002", ckpt=avatar))
 
 
@@ -209,7 +209,7 @@ def test_an_interrupted_run_leaves_the_results_as_they_were(config, monkeypatch)
 
 def test_a_folder_that_cannot_be_written_is_found_before_the_work(config, tmp_path, monkeypatch):
     monkeypatch.setattr("os.access", lambda path, mode: False)
-    with pytest.raises(UserError, match="cannot write results to .*eval_id"):
+    with pytest.raises(UserError, match=r"cannot write results to .*eval_id"):
         run(config)
 
 
@@ -256,9 +256,13 @@ def test_the_yaml_fits_the_settings():
 def test_surfaces_are_compared(config, store, caplog):
     run(replace(config, surface_frames=2, surface_resolution=48))
     surfaces = read(folder_of(config) / "eval_id")["surfaces"]
-    assert surfaces["frames"] == 2 and surfaces["frames_without_surface"] == 0 and surfaces["resolution"] == 48
+    assert surfaces["frames"] == 2
+    assert surfaces["frames_without_surface"] == 0
+    assert surfaces["resolution"] == 48
     # half of the capsule is missing, and the other half is 3 cm too thin
-    assert 0.03 < surfaces["chamfer_m"] < 0.3 and surfaces["f_score"] == 0 and 0.5 < surfaces["normal_consistency"] < 1
+    assert 0.03 < surfaces["chamfer_m"] < 0.3
+    assert surfaces["f_score"] == 0
+    assert 0.5 < surfaces["normal_consistency"] < 1
     assert "surfaces of 2 frames at resolution 48: Chamfer distance" in caplog.text
     run(config)
     assert read(folder_of(config) / "eval_id")["surfaces"] is None

@@ -63,10 +63,12 @@ def test_pose_files_become_clips(folder, capsys, caplog):
     path = folder / "export" / "50002.glb"
     assert sorted(file.name for file in path.parent.iterdir()) == ["50002.glb", "50002_glb.json"]
     reader = GlbReader(path)
-    assert list(reader.clips) == ["walk", "jump", "walk_2"] and len(reader.faces()) <= 400
+    assert list(reader.clips) == ["walk", "jump", "walk_2"]
+    assert len(reader.faces()) <= 400
     assert max(reader.array(sampler.input).max() for sampler in reader.clips["jump"].samplers) == pytest.approx(6 / 60)
     record = json.loads((path.parent / "50002_glb.json").read_text())
-    assert record["bytes"] == path.stat().st_size and record["config"]["influences"] == 4
+    assert record["bytes"] == path.stat().st_size
+    assert record["config"]["influences"] == 4
     assert [(clip["name"], clip["frames"]) for clip in record["clips"]] == [("walk", 5), ("jump", 7), ("walk_2", 5)]
     assert record["truncation_mm"] == reader.gltf.asset.extras["snarf"]["truncation_mm"]
     text = " ".join(caplog.text.split())
@@ -81,7 +83,8 @@ def test_an_avatar_given_by_its_file_names_what_is_made_of_it(folder, toy, capsy
     code, err = export(capsys, "--pose", pose_file("walk.npz", 1), "ckpt=elsewhere/avatar.pt")
     assert code == 0, err
     reader = GlbReader(Path("elsewhere/export/my_dog.glb"))
-    assert reader.gltf.meshes[0].name == "my_dog" and "my_dog_rig" in [node.name for node in reader.gltf.nodes]
+    assert reader.gltf.meshes[0].name == "my_dog"
+    assert "my_dog_rig" in [node.name for node in reader.gltf.nodes]
     toy.facts = {}
     assert export(capsys, "--pose", "walk.npz", "ckpt=elsewhere", "format=ply")[0] == 0
     assert Path("elsewhere/export/50002_ply").is_dir()
@@ -89,7 +92,8 @@ def test_an_avatar_given_by_its_file_names_what_is_made_of_it(folder, toy, capsy
 
 def test_null_is_no_motion_file(folder, capsys):
     code, err = export(capsys, "pose=null", "motion=null")
-    assert code == 2 and "motion jumping_jacks is for SMPL's 24 joints" in err  # what there is without either
+    assert code == 2
+    assert "motion jumping_jacks is for SMPL's 24 joints" in err
     pose_file("walk.npz", 1)
     assert export(capsys, "pose=[walk.npz]", "motion=null")[0] == 0
 
@@ -117,21 +121,26 @@ def test_a_mesh_a_frame(folder, toy, capsys, suffix):
     motion = wave(4)
     surface = SkinnedSurface(toy, 40, mesh=toy.skinned_surface(40).mesh)
     whole = surface.posed(*(torch.from_numpy(part[2]).float() for part in (motion.poses, motion.translation)))
-    assert len(loaded.faces) <= 400 < len(whole.faces) and loaded.is_watertight
+    assert len(loaded.faces) <= 400 < len(whole.faces)
+    assert loaded.is_watertight
     np.testing.assert_allclose(loaded.bounds, whole.bounds, atol=3e-3)  # of decimated and whole mesh
     assert np.ptp(loaded.visual.vertex_colors[:, :3], axis=0).max() > 50
     code, err = export(capsys, *arguments)
-    assert code == 2 and "already; give overwrite=true" in err
+    assert code == 2
+    assert "already; give overwrite=true" in err
     assert export(capsys, *arguments, "overwrite=true", "max_frames=1")[0] == 0
     assert sorted(path.name for path in place.iterdir()) == ["export.json", names[0]]
     (place / "notes.txt").write_text("mine")
     code, err = export(capsys, *arguments, "overwrite=true")
-    assert code == 2 and "holds notes.txt, which is no frame of an export" in err and (place / "notes.txt").exists()
+    assert code == 2
+    assert "holds notes.txt, which is no frame of an export" in err
+    assert (place / "notes.txt").exists()
 
 
 def test_what_meshes_do_not_use_is_said(folder, capsys, caplog):
     arguments = ("--pose", pose_file("walk.npz", 1), "format=ply", "output=out", "overwrite=true")
-    assert export(capsys, *arguments)[0] == 0 and "not used" not in caplog.text
+    assert export(capsys, *arguments)[0] == 0
+    assert "not used" not in caplog.text
     assert export(capsys, *arguments, "influences=8", "morph_targets=0")[0] == 0
     assert "influences=8, morph_targets=0: not used, meshes of format=ply have all weights" in caplog.text
 
@@ -197,7 +206,8 @@ def test_new_frames_are_never_lost(tmp_path, monkeypatch):
         (temporary / "frame_000000.ply").write_text("new")
     assert (folder / "frame_000000.ply").read_text() == "old"
     assert (Path(str(caught.value).rpartition(" in ")[2]) / "frame_000000.ply").read_text() == "new"
-    assert renamed[0] == folder and len(list(tmp_path.iterdir())) == 2
+    assert renamed[0] == folder
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_an_existing_file_stays_until_overwrite(folder, capsys):
@@ -207,19 +217,24 @@ def test_an_existing_file_stays_until_overwrite(folder, capsys):
     path.write_bytes(b"mine")
     (folder / "avatar.pt").unlink()  # refused before anything is looked at
     code, err = export(capsys, *arguments)
-    assert code == 2 and err.endswith("50002.glb is there already; give overwrite=true to replace it, or output=FILE\n")
+    assert code == 2
+    assert err.endswith("50002.glb is there already; give overwrite=true to replace it, or output=FILE\n")
     assert path.read_bytes() == b"mine"
     (folder / "avatar.pt").write_bytes(b"the toy")
-    assert export(capsys, *arguments, "overwrite=true")[0] == 0 and path.read_bytes()[:4] == b"glTF"
+    assert export(capsys, *arguments, "overwrite=true")[0] == 0
+    assert path.read_bytes()[:4] == b"glTF"
 
 
 def test_a_file_where_the_record_goes_stays_until_overwrite(folder, toy, capsys):
     Path("me_glb.json").write_text("mine")
     arguments = ("--pose", pose_file("walk.npz", 1), "output=me.glb")
     code, err = export(capsys, *arguments)
-    assert code == 2 and "me_glb.json is there already; give overwrite=true to replace it" in err
-    assert Path("me_glb.json").read_text() == "mine" and not Path("me.glb").exists()
-    assert export(capsys, *arguments, "overwrite=true")[0] == 0 and "me.glb" in Path("me_glb.json").read_text()
+    assert code == 2
+    assert "me_glb.json is there already; give overwrite=true to replace it" in err
+    assert Path("me_glb.json").read_text() == "mine"
+    assert not Path("me.glb").exists()
+    assert export(capsys, *arguments, "overwrite=true")[0] == 0
+    assert "me.glb" in Path("me_glb.json").read_text()
 
 
 def test_a_crash_leaves_nothing(folder, capsys, monkeypatch):
@@ -229,7 +244,8 @@ def test_a_crash_leaves_nothing(folder, capsys, monkeypatch):
     pose_file("walk.npz", 3)
     monkeypatch.setattr("snarfcli.export.glb.Path.write_bytes", fail)
     code, err = export(capsys, "--pose", "walk.npz")
-    assert code == 2 and "the disk is full" in err
+    assert code == 2
+    assert "the disk is full" in err
     monkeypatch.undo()
     monkeypatch.chdir(folder.parents[3])
     monkeypatch.setattr(selection.Avatar, "load", classmethod(lambda cls, path, device: ToyCharacter()))
@@ -287,7 +303,9 @@ def test_what_a_user_can_get_wrong(folder, capsys, arguments, message):
     import re
 
     code, err = export(capsys, *arguments)
-    assert code == 2 and re.search(message, err) and len(err.splitlines()) == 1
+    assert code == 2
+    assert re.search(message, err)
+    assert len(err.splitlines()) == 1
     assert not (folder / "export").exists()
 
 
@@ -297,15 +315,18 @@ def test_what_a_user_can_get_wrong(folder, capsys, arguments, message):
 def test_an_avatar_without_surface_is_a_line(folder, capsys, monkeypatch, logit, suffix, height):
     monkeypatch.setattr(ToyCharacter, "canonical_logits", lambda self, points, pose: torch.full((len(points),), logit))
     code, err = export(capsys, "--pose", pose_file("walk.npz"), f"format={suffix}", f"height={height}")
-    assert code == 2 and len(err.splitlines()) == 1
-    assert "this avatar has no surface to export: the field is" in err and "train it longer" in err
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert "this avatar has no surface to export: the field is" in err
+    assert "train it longer" in err
     assert not (folder / "export").exists()
 
 
 def test_an_avatar_without_weights_is_refused(folder, toy, capsys, monkeypatch):
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
     code, err = export(capsys, "--pose", pose_file("walk.npz"))
-    assert code == 2 and "a rig needs skinning weights of canonical points, which model fast_snarf does not have" in err
+    assert code == 2
+    assert "a rig needs skinning weights of canonical points, which model fast_snarf does not have" in err
     assert not (folder / "export").exists()
 
 
@@ -329,7 +350,8 @@ def fake_blender(tmp_path, monkeypatch):
 def test_without_blender_one_line_says_how_to_get_it(folder, toy, capsys, fake_blender, monkeypatch):
     monkeypatch.setattr(toy, "skinned_surface", None)  # nothing is made
     code, err = export(capsys, "--pose", pose_file("walk.npz"), "format=fbx")
-    assert code == 2 and "fbx and usd are written by Blender, which is not here; pip install 'snarf[blender]'" in err
+    assert code == 2
+    assert "fbx and usd are written by Blender, which is not here; pip install 'snarf[blender]'" in err
 
 
 def test_blender_gets_a_whole_glb(folder, capsys, fake_blender):
@@ -338,7 +360,8 @@ def test_blender_gets_a_whole_glb(folder, capsys, fake_blender):
     assert (folder / "export" / "50002.fbx").read_bytes() == b"glTF24.0fbx"
     assert sorted(path.name for path in (folder / "export").iterdir()) == ["50002.fbx", "50002_fbx.json"]
     code, err = export(capsys, "--pose", "walk.npz", "--pose", "walk.npz", "format=usd")
-    assert code == 2 and "usd holds one timeline, got 2 motions" in err
+    assert code == 2
+    assert "usd holds one timeline, got 2 motions" in err
 
 
 @pytest.mark.parametrize("kind", ["fbx", "usd"])
@@ -351,11 +374,13 @@ def test_blender_is_told_the_format_whatever_the_case_of_the_suffix(folder, caps
 def test_a_crash_of_blender_leaves_nothing(folder, capsys, fake_blender):
     fake_blender("open(path, 'wb').write(b'half'); print('about to'); sys.exit('Error: out of patience')")
     code, err = export(capsys, "--pose", pose_file("walk.npz", 2), "format=fbx")
-    assert code == 2 and "Blender could not write 50002.fbx (Error: out of patience); give format=glb" in err
+    assert code == 2
+    assert "Blender could not write 50002.fbx (Error: out of patience); give format=glb" in err
     assert not (folder / "export").exists()
 
 
 def test_the_report_says_what_a_clip_lasts():
     numbers = {"max_mm": 0.0, "p99_mm": 0.0, "rms_mm": 0.0}
     report = ExportReport(Path("a.glb"), 1, 1, 1, 1, 4, numbers, 0, numbers, numbers, numbers, ())
-    assert report.morph_share == 1 and "0 morph targets explain 100.0 %" in " ".join(report.lines())
+    assert report.morph_share == 1
+    assert "0 morph targets explain 100.0 %" in " ".join(report.lines())

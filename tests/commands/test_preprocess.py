@@ -61,8 +61,10 @@ def test_samples_do_not_depend_on_workers_or_interruptions(
     caplog.set_level(logging.INFO)
     one, two = tmp_path / "one", tmp_path / "two"
     preprocess.run(_config(one, workers=1))
-    assert "39 frames, 15600 samples in" in caplog.text and "samples/s" in caplog.text
-    assert "bytes a frame" in caplog.text and "label 0.000 % of the points differently" in caplog.text
+    assert "39 frames, 15600 samples in" in caplog.text
+    assert "samples/s" in caplog.text
+    assert "bytes a frame" in caplog.text
+    assert "label 0.000 % of the points differently" in caplog.text
     preprocess.run(_config(two, sequences=["fold"]))
     assert [entry["name"] for entry in json.loads(_contents(two)["manifest.json"])["sequences"]] == ["fold"]
     caplog.clear()
@@ -114,7 +116,8 @@ def test_settings_are_not_mixed(tmp_path: Path, subject: list[SubjectData]) -> N
     assert _contents(tmp_path) == before
     preprocess.run(_config(tmp_path, overwrite=True, seed=5, inside_test="parity", **few))
     manifest = json.loads(_contents(tmp_path)["manifest.json"])
-    assert manifest["settings"]["seed"] == 5 and manifest["settings"]["inside_test"] == "parity"
+    assert manifest["settings"]["seed"] == 5
+    assert manifest["settings"]["inside_test"] == "parity"
     assert _contents(tmp_path)["ood/fold/points.npy"] != before["ood/fold/points.npy"]
 
 
@@ -162,9 +165,7 @@ def test_a_damaged_sequence_is_made_again(tmp_path: Path, subject: list[SubjectD
         preprocess.run(_config(tmp_path, **few))
 
 
-def test_an_open_mesh_is_said_once(
-    tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_open_mesh_is_said_once(tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture) -> None:
     body = toy_body()
     subject[0] = toy_subject(body=replace(body, faces=body.faces[1:]))
     few = {"sequences": ["fold"], "workers": 1}
@@ -278,10 +279,11 @@ def test_files_are_read_before_anything_is_lost(
     with pytest.raises(UserError, match=r"fold_1\.ply.*; give skip_broken=true"):
         preprocess.run(_config(data, overwrite=True))
     assert _contents(data) == before  # what was there is still there
-    with pytest.raises(UserError, match="fold was made from other meshes .* delete it to make it anew"):
+    with pytest.raises(UserError, match=r"fold was made from other meshes .* delete it to make it anew"):
         preprocess.run(_config(data))
     preprocess.run(_config(data, overwrite=True, skip_broken=True))
     manifest = json.loads(_contents(data)["manifest.json"])
     assert [entry["name"] for entry in manifest["sequences"]] == ["wave"]
     assert [entry["name"] for entry in manifest["skipped"]] == ["fold"]
-    assert "left out: sequence fold" in caplog.text and "fold_1.ply" in caplog.text
+    assert "left out: sequence fold" in caplog.text
+    assert "fold_1.ply" in caplog.text

@@ -45,7 +45,9 @@ def choose(skeleton: Skeleton, pose: str, **changes):
 def test_frames_are_taken_as_asked_for(skeleton, walk):
     whole = read_motion(walk, skeleton, up="y")
     chosen = choose(skeleton, walk, start=3, stop=20, step=4, max_frames=3)
-    assert chosen.numbers == [3, 7, 11] and chosen.first == 3 and chosen.bone_transforms is None
+    assert chosen.numbers == [3, 7, 11]
+    assert chosen.first == 3
+    assert chosen.bone_transforms is None
     assert chosen.motion.frame_rate == RATE / 4
     np.testing.assert_array_equal(chosen.motion.poses, whole.poses[[3, 7, 11]])
     assert choose(skeleton, walk, start=-2).numbers == [FRAMES - 2, FRAMES - 1]
@@ -54,7 +56,9 @@ def test_frames_are_taken_as_asked_for(skeleton, walk):
 def test_resampling_keeps_the_pace(skeleton, walk):
     chosen = choose(skeleton, walk, start=4, stop=21, frame_rate=60.0)  # 16 intervals of a 24th: two thirds of a second
     motion = chosen.motion
-    assert motion.frame_rate == 60 and motion.num_frames == 41 and chosen.numbers == list(range(41))
+    assert motion.frame_rate == 60
+    assert motion.num_frames == 41
+    assert chosen.numbers == list(range(41))
     time = 4 / RATE + np.arange(41) / 60
     np.testing.assert_allclose(motion.poses[:, 0, 1], np.pi * time, atol=1e-9)
     np.testing.assert_allclose(motion.translation[:, 0], 2 * time, atol=1e-9)

@@ -106,18 +106,22 @@ def test_the_page_is_served_and_opened(served, opened, caplog):
     with caplog.at_level(logging.INFO):
         server = served()
     address = f"http://127.0.0.1:{server.port}"
-    assert opened == [address] and f"page: {address} (Ctrl-C ends it)" in caplog.text
-    assert "ssh -L" not in caplog.text and "anybody" not in caplog.text
+    assert opened == [address]
+    assert f"page: {address} (Ctrl-C ends it)" in caplog.text
+    assert "ssh -L" not in caplog.text
+    assert "anybody" not in caplog.text
     with urllib.request.urlopen(address, timeout=60) as answer:
         assert answer.status == 200
-    assert server.viewing.motion is None and server.viewing.look.skinned_resolution == 24
+    assert server.viewing.motion is None
+    assert server.viewing.look.skinned_resolution == 24
 
 
 def test_without_a_display_the_way_from_elsewhere_is_told(served, opened, monkeypatch, caplog):
     monkeypatch.setattr(view, "can_open_browser", lambda: False)
     with caplog.at_level(logging.INFO):
         server = served()
-    assert not opened and f"ssh -L {server.port}:127.0.0.1:{server.port} " in caplog.text
+    assert not opened
+    assert f"ssh -L {server.port}:127.0.0.1:{server.port} " in caplog.text
 
 
 def test_no_browser_if_not_wanted(served, opened):
@@ -137,7 +141,8 @@ def test_who_listens_to_all_is_warned(served, opened, caplog):
 def test_pose_files_are_on_the_shelf_and_the_first_one_plays(served):
     files = [pose_file("wave.npz"), pose_file("bend.npz", 5), pose_file("other/wave.npz", 4)]
     server = served(pose=files)
-    assert server.viewing.player.is_playing and server.viewing.motion.num_frames == 3
+    assert server.viewing.player.is_playing
+    assert server.viewing.motion.num_frames == 3
     assert server.controls.motion.names.options == ("none", "file: wave.npz", "file: bend.npz", "file: other/wave.npz")
     assert server.controls.motion.names.value == "file: wave.npz"
     server.controls.motion.choose("file: other/wave.npz")
@@ -184,7 +189,8 @@ def test_without_viser_one_line_before_any_work(config, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", "ckpt=nowhere.pt"]) == 2
     err = capsys.readouterr().err
-    assert "pip install 'snarf[view]'" in err and err.count("\n") == 1
+    assert "pip install 'snarf[view]'" in err
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

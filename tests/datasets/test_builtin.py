@@ -25,18 +25,24 @@ def subjects():
 
 
 def test_ids_are_dfausts():
-    assert len(BUILTIN_SUBJECTS) == 10 and BUILTIN_SUBJECTS[0] == "50002" and BUILTIN_SUBJECTS[-1] == "50027"
+    assert len(BUILTIN_SUBJECTS) == 10
+    assert BUILTIN_SUBJECTS[0] == "50002"
+    assert BUILTIN_SUBJECTS[-1] == "50027"
 
 
 @pytest.mark.parametrize("subject", BUILTIN_SUBJECTS)
 def test_one_sequence_is_held_out(subjects, subject):
     data = subjects[subject]
-    assert data.data == "builtin" and data.subject == subject
+    assert data.data == "builtin"
+    assert data.subject == subject
     train, test, ood = ([sequence.name for sequence in data.of_split(split)] for split in ("train", "test", "ood"))
-    assert len(train) == 9 and len(set(train)) == 9
-    assert test == [HELD_OUT_SEQUENCES[subject]] and test[0] not in train
+    assert len(train) == 9
+    assert len(set(train)) == 9
+    assert test == [HELD_OUT_SEQUENCES[subject]]
+    assert test[0] not in train
     assert set(train + test) <= set(TRAINING_SEQUENCES)
-    assert ood == list(OUT_OF_DISTRIBUTION_SEQUENCES) and len(ood) == 7
+    assert ood == list(OUT_OF_DISTRIBUTION_SEQUENCES)
+    assert len(ood) == 7
     assert all(sequence.motion.frame_rate == 60.0 for sequence in data.sequences)
 
 
@@ -46,7 +52,8 @@ def test_every_exercise_is_someones(subjects):
 
 def test_shapes_are_plausible_and_distinct(subjects):
     for data in subjects.values():
-        assert np.abs(data.betas).max() <= 2 and data.betas.shape == (10,)
+        assert np.abs(data.betas).max() <= 2
+        assert data.betas.shape == (10,)
         height = np.ptp(BODY.shaped(data.betas)[0][:, 1].numpy())
         assert 1.45 < height < 1.95
     for one, other in combinations(subjects.values(), 2):
@@ -83,7 +90,7 @@ def test_feet_reach_everyones_own_floor(subjects):
 def test_unknown_subject():
     with pytest.raises(UserError, match=r"no built-in subject '50003'; did you mean '500\d\d'\? Known are 50002, 50004"):
         builtin_subject("50003")
-    with pytest.raises(UserError, match="no built-in subject 'me'. Known are"):
+    with pytest.raises(UserError, match=r"no built-in subject 'me'. Known are"):
         builtin_subject("me")
 
 
@@ -92,7 +99,8 @@ def test_a_body_of_ones_own(tmp_path):
     path = write_body(tmp_path / "smpl" / "models").rename(tmp_path / "smpl" / "models" / "SMPL_NEUTRAL.npz")
     request = Request(DataConfig("builtin", 1, 1, 1), tmp_path, body=str(tmp_path / "smpl"))
     own, first = load("50004", request), builtin_subject("50004")
-    assert own.sources[0] == f"body {path}" and own.data == "builtin"
+    assert own.sources[0] == f"body {path}"
+    assert own.data == "builtin"
     np.testing.assert_allclose(own.template.vertices, first.template.vertices, atol=1e-6)
     with pytest.raises(UserError, match="neutral"):
         load("50004", Request(request.config, tmp_path, body=str(write_body(tmp_path / "other").parent)))

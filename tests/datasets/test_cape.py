@@ -40,7 +40,8 @@ def test_meshes_fit_the_bones(root: Path) -> None:
     hips = subject.sequences[0]
     np.testing.assert_array_equal(hips.frames, [0, 2, 4])
     vertices, faces = hips.meshes[2]
-    assert vertices.shape == (6890, 3) and faces.shape == (13776, 3)
+    assert vertices.shape == (6890, 3)
+    assert faces.shape == (13776, 3)
     # at the origin: the pelvis is where forward kinematics without a translation puts it
     body = load_body(next((root / "smpl").iterdir()))
     posed = body.pose(torch.from_numpy(hips.motion.poses[2:3]))
@@ -78,10 +79,12 @@ def test_broken_frames_are_left_out(root: Path, caplog: pytest.LogCaptureFixture
     with caplog.at_level(logging.WARNING):
         subject = load(root)
     np.testing.assert_array_equal(subject.sequences[0].frames, [0, 4])
-    assert "hips: 1 of 3 frames cannot be read and are left out" in caplog.text and "longshort_hips.000003.npz" in caplog.text
-    assert [name for name, _ in subject.broken] == ["squat"] and "longshort_squat.000001.npz" in subject.broken[0][1]
+    assert "hips: 1 of 3 frames cannot be read and are left out" in caplog.text
+    assert "longshort_hips.000003.npz" in caplog.text
+    assert [name for name, _ in subject.broken] == ["squat"]
+    assert "longshort_squat.000001.npz" in subject.broken[0][1]
     sampling = SamplingSettings(points_per_frame=80, surface_noise_m=0.01, padding=0.1, inside_test="winding", seed=0)
-    with pytest.raises(UserError, match="sequence squat cannot be used.*skip_broken=true"):
+    with pytest.raises(UserError, match=r"sequence squat cannot be used.*skip_broken=true"):
         preprocess_subject(subject, tmp_path / "out", sampling, {"train": 2, "test": 2, "ood": 2})
     preprocess_subject(subject, tmp_path / "out", sampling, {"train": 2, "test": 2, "ood": 2}, skip_broken=True)
     store = SampleStore.open(tmp_path / "out", "cape", "00032_longshort")
@@ -96,14 +99,14 @@ def test_what_is_missing_is_named(root: Path, tmp_path_factory: pytest.TempPathF
         load(root, "00033_longshort")
     with pytest.raises(UserError, match="no sequence is left to train on"):
         load(root, test=["*"])
-    with pytest.raises(UserError, match="no cape_release/sequences .* below"):
+    with pytest.raises(UserError, match=r"no cape_release/sequences .* below"):
         load(tmp_path_factory.mktemp("empty"))
     minimal = root / "cape_release" / "minimal_body_shape" / "00032" / "00032_minimal.npy"
     np.save(minimal, np.zeros((10, 3)))
     with pytest.raises(UserError, match=r"00032_minimal.npy must be finite numbers of shape \[6890, 3\], got \[10, 3\]"):
         load(root)
     (root / "cape_release" / "misc" / "subj_genders.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
-    with pytest.raises(UserError, match="subj_genders.pkl"):
+    with pytest.raises(UserError, match=r"subj_genders.pkl"):
         load(root)
 
 

@@ -53,15 +53,18 @@ def test_a_good_folder_is_usable_and_drawn(caplog, good):
 
     code, lines = checked(caplog, good)
     assert code == 0
-    assert line_with(lines, "subjects: rex") and line_with(lines, "19 joints, 18 bones; canonical pose: the rest pose")
-    assert line_with(lines, "scaled by") and line_with(lines, "278 vertices, 552 faces, the same in all 6 frames")
+    assert line_with(lines, "subjects: rex")
+    assert line_with(lines, "19 joints, 18 bones; canonical pose: the rest pose")
+    assert line_with(lines, "scaled by")
+    assert line_with(lines, "278 vertices, 552 faces, the same in all 6 frames")
     assert line_with(lines, "100 % of the joints are inside the meshes")
     assert f'usable; next: "snarf preprocess data=meshes subject=rex data.folder={good}"' in lines[-1]
     path = good.parent / "outputs" / "doctor" / "meshes_rex.png"
     assert str(path) in line_with(lines, "  figure ")
     picture = np.asarray(Image.open(path).convert("RGB")).astype(int)
     orange = (np.abs(picture - (235, 94, 40)).sum(-1) < 30).sum()
-    assert picture.shape[1] > 1000 and orange > 2000
+    assert picture.shape[1] > 1000
+    assert orange > 2000
 
 
 def test_another_place_for_the_figure(caplog, good, tmp_path):
@@ -107,11 +110,13 @@ def test_closed_meshes_inside_out_and_broken_files_are_named(caplog, bad):
 def test_broken_sequences_and_missing_things_are_problems_without_a_trace(caplog, bad):
     (bad / "rex" / "sit" / "frame_3.obj").unlink()
     code, lines = checked(caplog, bad)
-    assert code == 2 and "PROBLEM: sit: " in line_with(lines, "  broken ")
+    assert code == 2
+    assert "PROBLEM: sit: " in line_with(lines, "  broken ")
     assert "has 3 meshes, but poses.npz has 4 frames" in line_with(lines, "  broken ")
     (bad / "rex" / "skeleton.npz").write_bytes(b"nothing")
     code, lines = checked(caplog, bad)
-    assert code == 2 and "PROBLEM: skeleton file" in line_with(lines, "  not usable ")
+    assert code == 2
+    assert "PROBLEM: skeleton file" in line_with(lines, "  not usable ")
     with pytest.raises(UserError, match="is not there"):
         checked(caplog, bad.parent / "nothing")
 
@@ -121,13 +126,15 @@ def test_a_fault_of_the_program_is_a_line_too(caplog, good, monkeypatch):
 
     monkeypatch.setattr(meshes, "load", lambda subject, request: 1 / 0)
     code, lines = checked(caplog, good)
-    assert code == 2 and "PROBLEM: ZeroDivisionError: division by zero" in line_with(lines, "  not usable ")
+    assert code == 2
+    assert "PROBLEM: ZeroDivisionError: division by zero" in line_with(lines, "  not usable ")
 
 
 def test_several_subjects_are_checked_and_the_others_named(caplog, tmp_path):
     for name in "abcd":
         (tmp_path / f"{name}.glb").write_bytes(animal_glb(ANIMAL, MOTIONS))
     code, lines = checked(caplog, tmp_path)
-    assert code == 0 and "1 subjects more; give subject=NAME or subject=all" in lines
+    assert code == 0
+    assert "1 subjects more; give subject=NAME or subject=all" in lines
     assert [line for line in lines if line.startswith("subject ")] == ["subject a", "subject b", "subject c"]
     assert line_with(lines, "rigged file")

@@ -57,10 +57,12 @@ def bent(person, joint: str, axis_angle) -> np.ndarray:
 
 
 def test_the_same_person_as_without_clothes(person, bare):
-    assert find_source("clothed").subjects is subjects and person.data == "clothed"
+    assert find_source("clothed").subjects is subjects
+    assert person.data == "clothed"
     assert [(s.name, s.split) for s in person.sequences] == [(s.name, s.split) for s in bare.sequences]
     for one, other in zip(person.sequences, bare.sequences, strict=True):
-        assert np.array_equal(one.motion.poses, other.motion.poses) and len(one.meshes) == one.motion.num_frames
+        assert np.array_equal(one.motion.poses, other.motion.poses)
+        assert len(one.meshes) == one.motion.num_frames
     assert torch.equal(person.skeleton.joints_rest, bare.skeleton.joints_rest)
 
 
@@ -89,7 +91,8 @@ def test_cloth_stands_off_the_body_and_skin_does_not(clothed, distance):
     assert stand_off.max() < outfit.stand_off_m + outfit.flare_m + 0.03  # hollows are bridged
     cloth = stand_off[~is_skin]
     # The rest are rims, from the skin out to the edge of the cloth.
-    assert np.median(cloth) > outfit.stand_off_m and (cloth > 0.9 * _LEAST_STAND_OFF_M).mean() > 0.9
+    assert np.median(cloth) > outfit.stand_off_m
+    assert (cloth > 0.9 * _LEAST_STAND_OFF_M).mean() > 0.9
 
 
 def test_trunk_is_covered_and_hands_feet_and_head_are_not(clothed, bare):
@@ -98,9 +101,11 @@ def test_trunk_is_covered_and_hands_feet_and_head_are_not(clothed, bare):
     depth = cKDTree(clothed.mesh.vertices).query(vertices)[0]
     inside = occupancies(clothed.mesh.vertices, clothed.mesh.faces, vertices)
     trunk = np.array([bone in ("spine1", "spine2") for bone in bones])
-    assert inside[trunk].all() and depth[trunk].min() > 0.7 * _LEAST_STAND_OFF_M
+    assert inside[trunk].all()
+    assert depth[trunk].min() > 0.7 * _LEAST_STAND_OFF_M
     shown = np.array([bone in ("head", "l_hand", "r_hand", "l_foot", "r_foot", "l_ankle") for bone in bones])
-    assert shown.any() and depth[shown].max() < 0.01  # some lie inside of others, as between toes
+    assert shown.any()
+    assert depth[shown].max() < 0.01
     assert np.median(depth[shown]) < 1e-6
 
 
@@ -122,7 +127,8 @@ def test_folds_are_shallower_than_the_stand_off_and_none_in_the_canonical_pose(p
     poses = np.concatenate([sequence.motion.poses[::97] for sequence in person.of_split("ood")])
     height = folds.displacement(clothed.turned(poses))
     assert (np.abs(height) <= 0.6 * stand_off + 1e-12).all()
-    assert 0.008 < np.abs(height).max() < 0.02 and np.abs(height[:, stand_off < 1e-5]).max() < 1e-5
+    assert 0.008 < np.abs(height).max() < 0.02
+    assert np.abs(height[:, stand_off < 1e-5]).max() < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -135,7 +141,8 @@ def test_folds_come_with_the_joint_that_bends_and_only_near_it(person, clothed, 
     away = np.linalg.norm(clothed.mesh.vertices - at, axis=1)
     assert np.abs(height[away < 0.2]).max() > 0.004
     assert np.abs(height[away > 0.37]).max() < 1e-6
-    assert height.min() < -0.002 and height.max() > 0.002  # in and out
+    assert height.min() < -0.002
+    assert height.max() > 0.002
 
 
 def test_a_small_change_of_pose_is_a_small_change_of_the_cloth(person, clothed):
@@ -155,9 +162,11 @@ def test_frames_are_the_same_alone_and_together(person):
     assert isinstance(together, ArrayMeshes)  # which worker processes get without PyTorch
     for index, frame in enumerate((3, 40)):
         vertices, faces = meshes[frame]
-        assert vertices.dtype == np.float32 and faces.dtype == np.int32
+        assert vertices.dtype == np.float32
+        assert faces.dtype == np.int32
         np.testing.assert_allclose(together[index][0], vertices, atol=1e-6)
-    assert meshes.source(0) == "" and meshes.fingerprint() == ""
+    assert meshes.source(0) == ""
+    assert meshes.fingerprint() == ""
 
 
 def test_another_process_makes_the_same_clothes(person):
@@ -173,7 +182,8 @@ def test_another_process_makes_the_same_clothes(person):
 
 def test_everybody_has_clothes_of_their_own():
     outfits = [outfit_of(subject) for subject in BUILTIN_SUBJECTS]
-    assert len(set(outfits)) == len(outfits) and outfits == [outfit_of(subject) for subject in BUILTIN_SUBJECTS]
+    assert len(set(outfits)) == len(outfits)
+    assert outfits == [outfit_of(subject) for subject in BUILTIN_SUBJECTS]
     assert {(o.sleeve > 0.5, o.leg > 0.5) for o in outfits} == {(a, b) for a in (False, True) for b in (False, True)}
 
 
@@ -181,7 +191,8 @@ def test_a_body_of_ones_own_and_an_unknown_subject(tmp_path):
     path = write_body(tmp_path / "smpl" / "models").rename(tmp_path / "smpl" / "models" / "SMPL_NEUTRAL.npz")
     request = Request(DataConfig("clothed", 1, 1, 1), tmp_path, body=str(tmp_path / "smpl"))
     own = load("50004", request)
-    assert own.sources[0] == f"body {path}" and "long sleeves, short trousers" in own.sources[-1]
+    assert own.sources[0] == f"body {path}"
+    assert "long sleeves, short trousers" in own.sources[-1]
     assert own.sequences[0].meshes.clothed.body.num_joints == builtin_body().num_joints
     with pytest.raises(UserError, match="no built-in subject '50003'"):
         load("50003", Request(request.config, tmp_path))

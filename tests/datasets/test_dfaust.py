@@ -47,7 +47,8 @@ def test_the_papers_split(old: Path) -> None:
     subject = load(old)
     assert [s.name for s in subject.of_split("test")] == ["chicken_wings"]
     assert [s.name for s in subject.of_split("ood")] == ["op2", "op3", "op4", "op5", "op7", "op8", "op9"]
-    assert len(subject.of_split("train")) == 9 and not subject.broken
+    assert len(subject.of_split("train")) == 9
+    assert not subject.broken
     np.testing.assert_array_equal(subject.betas, BETAS[:10])
     for spec in subject.sequences:
         assert not spec.motion.translation.any()
@@ -55,7 +56,8 @@ def test_the_papers_split(old: Path) -> None:
     # z is up in AMASS; without the root the poses are those of the file, hands straight
     np.testing.assert_allclose(hips.motion.poses.reshape(-1, 72)[:, 3:], amass_poses("hips")[:, 3:])
     vertices, faces = hips.meshes[2]
-    assert vertices.shape == (6890, 3) and faces.shape == (13776, 3)
+    assert vertices.shape == (6890, 3)
+    assert faces.shape == (13776, 3)
     assert any("basicModel_f_lbs_10_207_0_v1.0.0.npz (female)" in line for line in subject.sources)
     split = papers_split()["dfaust"]
     assert len(split) == 10
@@ -109,17 +111,19 @@ def test_a_broken_recording_does_not_hide_the_person(tmp_path: Path) -> None:
     first = tmp_path / "DFaust" / "50002" / "50002_chicken_wings_stageii.npz"
     first.write_bytes(first.read_bytes()[:500])
     subject = load(tmp_path)
-    assert [name for name, _ in subject.broken] == ["chicken_wings"] and "meant for SMPL-X" in subject.sources[1]
+    assert [name for name, _ in subject.broken] == ["chicken_wings"]
+    assert "meant for SMPL-X" in subject.sources[1]
     np.testing.assert_array_equal(subject.betas, BETAS[:10])
     for path in first.parent.iterdir():
         path.write_bytes(b"")
-    with pytest.raises(UserError, match="50002_chicken_wings_stageii.npz"):
+    with pytest.raises(UserError, match=r"50002_chicken_wings_stageii.npz"):
         load(tmp_path)
 
 
 def test_poseprior_alone(old: Path) -> None:
     prior, dfaust = load(old, "poseprior"), load(old)
-    assert prior.data == "poseprior" and {s.split for s in prior.sequences} == {"ood"}
+    assert prior.data == "poseprior"
+    assert {s.split for s in prior.sequences} == {"ood"}
     np.testing.assert_array_equal(prior.betas, dfaust.betas)
     for mine, theirs in zip(prior.sequences, dfaust.of_split("ood"), strict=True):
         np.testing.assert_array_equal(mine.motion.poses, theirs.motion.poses)
@@ -131,7 +135,7 @@ def test_hands_are_one_of_two_choices(old: Path, data: str) -> None:
     released, rest = load(old, data, hands="released"), load(old, data)
     assert all(np.allclose(spec.motion.poses[:, 22:], 0.3) for spec in released.sequences)
     assert not any(spec.motion.poses[:, 22:].any() for spec in rest.sequences)
-    with pytest.raises(UserError, match="data.hands must be rest or released, got 'fist'"):
+    with pytest.raises(UserError, match=r"data.hands must be rest or released, got 'fist'"):
         load(old, data, hands="fist")
 
 
@@ -157,7 +161,8 @@ def test_what_is_missing_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixtu
     assert "no PosePrior (MPI_Limits) below" in caplog.text
     reasons = dict(subject.broken)
     assert sorted(reasons) == ["hips", "knees"]
-    assert "there is no file of it" in reasons["hips"] and "50002_knees_poses.npz" in reasons["knees"]
+    assert "there is no file of it" in reasons["hips"]
+    assert "50002_knees_poses.npz" in reasons["knees"]
     with pytest.raises(UserError, match=r"no PosePrior sequences below .*MPI_Limits/03099/op2_poses.npz"):
         load(tmp_path, "poseprior")
 
@@ -169,7 +174,8 @@ def test_from_files_to_tables(
     folders = [f"data_root={tmp_path}", f"data.folder={old}"]
     made = ["points_per_frame=160", "workers=2", f"body={old}", *folders]
     assert main(["preprocess", "data=dfaust", "sequences=[hips,chicken_wings,op2]", *made]) == 0
-    assert "from body" in caplog.text and "4 train, 4 test, 2 ood frames" in caplog.text
+    assert "from body" in caplog.text
+    assert "4 train, 4 test, 2 ood frames" in caplog.text
     assert main(["preprocess", "data=poseprior", "sequences=[op3]", *made]) == 0
     outputs = [f"output_root={tmp_path / 'out'}", f"data_root={tmp_path}"]
     small = ["training.steps=4", "training.poses_per_step=1", "training.uniform_points=40", "training.surface_points=40"]

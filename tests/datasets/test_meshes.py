@@ -113,7 +113,8 @@ def test_every_route_gives_the_same_subject(routes, route):
     assert [(spec.name, spec.split) for spec in subject.sequences] == [
         ("sit", "train"), ("sniff", "train"), ("trot", "train"), ("walk", "test"),
     ]  # fmt: skip
-    assert any("scaled by" in line for line in subject.sources) and not subject.broken
+    assert any("scaled by" in line for line in subject.sources)
+    assert not subject.broken
     assert np.ptp(subject.sequences[0].meshes[0][0], axis=0).max() == pytest.approx(1.8, rel=1e-3)
     assert (subject.template is None) == (not route.startswith("glb"))
     same_subject(meshes.load("rex", request(routes["poses"])), subject)
@@ -182,18 +183,22 @@ def test_transforms_that_stretch_are_kept(animal, tmp_path):
     np.savez(tmp_path / "rex" / "walk" / "poses.npz", bone_transforms=moved)
     subject = meshes.load("rex", request(tmp_path, scale="1"))
     kept = {spec.name: spec.posed_from_rest for spec in subject.sequences}
-    assert kept["sit"] is None and any("stretch" in line and "walk" in line for line in subject.sources)
+    assert kept["sit"] is None
+    assert any("stretch" in line and "walk" in line for line in subject.sources)
     np.testing.assert_allclose(kept["walk"], moved)
     preprocess_subject(subject, tmp_path / "data", SAMPLING, {"train": 1, "test": 1, "ood": 1})
     store = SampleStore.open(tmp_path / "data", "meshes", "rex")
     np.testing.assert_allclose(store.sequences("test")[0].bone_transforms, moved, atol=1e-6)
     motion, transforms = stored_motion(str(tmp_path / "data"), "meshes", "rex", None, store.skeleton)
-    assert motion.name == "walk" and motion.num_frames == FRAMES
+    assert motion.name == "walk"
+    assert motion.num_frames == FRAMES
     np.testing.assert_allclose(transforms, moved, atol=1e-6)
     assert stored_motion(str(tmp_path / "data"), "meshes", "rex", "sit", store.skeleton)[1] is None
     with pytest.raises(UserError, match="no sequence 'sti'; did you mean 'sit'"):
         stored_motion(str(tmp_path / "data"), "meshes", "rex", "sti", store.skeleton)
-    with pytest.raises(UserError, match="no motion for this skeleton .*snarf preprocess data=meshes subject=fox.* --pose FILE"):
+    with pytest.raises(
+        UserError, match=r"no motion for this skeleton .*snarf preprocess data=meshes subject=fox.* --pose FILE"
+    ):
         stored_motion(str(tmp_path / "data"), "meshes", "fox", None, store.skeleton)
 
 

@@ -59,10 +59,14 @@ def test_names_may_be_left_out_and_there_may_be_several_roots(tmp_path):
 
 def test_poses_may_be_folded_and_transforms_take_their_place(tmp_path):
     folded = read_poses(written(tmp_path, {"poses": np.ones((4, 9)), "trans": np.ones((4, 3))}, "poses.npz"), THREE)
-    assert folded.poses.shape == (4, 3, 3) and folded.num_frames == 4 and folded.frame_rate == DEFAULT_FRAME_RATE
+    assert folded.poses.shape == (4, 3, 3)
+    assert folded.num_frames == 4
+    assert folded.frame_rate == DEFAULT_FRAME_RATE
     transforms = np.tile(np.eye(4), (5, 3, 1, 1))
     read = read_poses(written(tmp_path, {"bone_transforms": transforms, "frame_rate": 24}, "poses.npz"), THREE)
-    assert read.poses is None and read.num_frames == 5 and read.frame_rate == 24
+    assert read.poses is None
+    assert read.num_frames == 5
+    assert read.frame_rate == 24
     np.testing.assert_array_equal(read.posed_from_rest, transforms)
 
 
@@ -92,7 +96,8 @@ def test_poses_may_be_folded_and_transforms_take_their_place(tmp_path):
 def test_a_broken_skeleton_is_named(tmp_path, changes, message):
     with pytest.raises(UserError, match=message) as error:
         read_skeleton(written(tmp_path, SKELETON | changes))
-    assert "skeleton.json" in str(error.value) and "\n" not in str(error.value)
+    assert "skeleton.json" in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -118,10 +123,10 @@ def test_broken_poses_are_named(tmp_path, content, message):
 
 @pytest.mark.parametrize("content", ["", "[1]", "{", "[" * 100_000, '{"parents": ' + "1" * 5000 + "}"])
 def test_what_is_no_json_is_said_to_be_none(tmp_path, content):
-    with pytest.raises(UserError, match="skeleton.json: is not"):
+    with pytest.raises(UserError, match=r"skeleton.json: is not"):
         read_skeleton(written(tmp_path, content))
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(UserError, match="no skeleton file at .*skeleton.json"):
+    with pytest.raises(UserError, match=r"no skeleton file at .*skeleton.json"):
         read_skeleton(tmp_path / "skeleton.json")

@@ -48,7 +48,8 @@ def angles_deg(sequence) -> np.ndarray:
     poses = sequence.motion.poses.copy()
     angles = np.rad2deg(poses[:, 1:3, 2])
     poses[:, 1:3, 2] = 0
-    assert not poses.any() and not sequence.motion.translation.any()
+    assert not poses.any()
+    assert not sequence.motion.translation.any()
     return angles
 
 
@@ -106,9 +107,12 @@ def test_bones_are_where_the_weights_say(sticks) -> None:
 @pytest.mark.parametrize("name", STICK_SUBJECTS)
 def test_angles_are_the_papers(sticks, name: str) -> None:
     train, test, ood = (sticks[name].of_split(split)[0] for split in ("train", "test", "ood"))
-    assert np.abs(angles_deg(test)).max() <= 60 and len(angles_deg(test)) == 60
+    assert np.abs(angles_deg(test)).max() <= 60
+    assert len(angles_deg(test)) == 60
     far = np.abs(angles_deg(ood))
-    assert far.min() >= 60 and far.max() <= 120 and len(far) == 60
+    assert far.min() >= 60
+    assert far.max() <= 120
+    assert len(far) == 60
     assert len({tuple(signs) for signs in np.sign(angles_deg(ood))}) == 4
     angles = angles_deg(train)
     assert np.abs(angles).max() <= 60 + 1e-9
@@ -120,7 +124,8 @@ def test_angles_are_the_papers(sticks, name: str) -> None:
         assert {tuple(pair) for pair in trained.round(6)} == {(a, b) for a in values for b in values}
         assert len(trained) == len(values) ** 2
     else:
-        assert len(trained) == 120 and np.ptp(trained, axis=0).min() > 110
+        assert len(trained) == 120
+        assert np.ptp(trained, axis=0).min() > 110
 
 
 def test_poses_are_the_same_every_time_and_shared_with_the_object(sticks) -> None:
@@ -161,7 +166,8 @@ def test_labels_are_the_union_of_what_is_moved(store: SampleStore) -> None:
             borders = cKDTree(np.concatenate([posed[is_border], _circle()]))
             wrong = points[(in_stick | on_disk) != labels, :2]
             # Chords of a centimetre, of the bent outline and of the disk, and points of it two millimetres apart.
-            assert len(wrong) < 5 and not (borders.query(wrong)[0] > 6e-3).any()
+            assert len(wrong) < 5
+            assert not (borders.query(wrong)[0] > 6e-3).any()
             near = borders.query(points[sequence.num_uniform // 5 :, :2])[0]
             assert np.quantile(near, 0.98) < 0.035  # Gaussian of 1 cm
     assert overlaps > 15  # the stick reaches the object: changes of topology
@@ -186,7 +192,8 @@ def test_fresh_points_are_of_the_plane_too(store: SampleStore) -> None:
     sequence = store.sequences("train")[0]
     drawn = FreshPoints([sequence], store.manifest["settings"], 1, 1500, 500, seed=0).draw(0)
     points, labels = drawn.points[0], drawn.occupied[0]
-    assert points.shape == (2000, 3) and not points[:, 2].any()
+    assert points.shape == (2000, 3)
+    assert not points[:, 2].any()
     vertices = sequence.vertices(drawn.frames[0][1])
     top = sequence.faces(0)[(vertices[sequence.faces(0)][..., 2] > 0).all(1)]
     chosen = np.r_[0:300, 1500:1800]
@@ -196,7 +203,8 @@ def test_fresh_points_are_of_the_plane_too(store: SampleStore) -> None:
 
 def test_manifest_says_that_the_samples_are_planar(store: SampleStore) -> None:
     assert store.manifest["settings"]["is_planar"] is True
-    assert store.template is not None and store.template.weights.shape[1] == 5
+    assert store.template is not None
+    assert store.template.weights.shape[1] == 5
 
 
 def test_other_subjects_keep_their_settings(tmp_path: Path) -> None:

@@ -183,7 +183,7 @@ def true_roots(
 
 def _first_nodes(cell: NDArray[np.int64], shape: tuple[int, int, int]):
     """Return the index (x, y, z) [M, 3] of each cell and the flat number [M] of its first node."""
-    depth, height, width = shape
+    _depth, height, width = shape
     x, y, z = cell % (width - 1), cell // (width - 1) % (height - 1), cell // ((width - 1) * (height - 1))
     return np.stack([x, y, z], 1), (z * height + y) * width + x
 

@@ -57,7 +57,8 @@ def test_the_search_undoes_skinning(name, softmax):
     torch.testing.assert_close(weights.sum(1), torch.ones(len(canonical)))
     for query, point in enumerate(canonical):
         distances = (found.canonical[found.query == query] - point).norm(dim=1)
-        assert len(distances) and float(distances.min()) < 1e-4
+        assert len(distances)
+        assert float(distances.min()) < 1e-4
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -71,7 +72,8 @@ def test_a_state_is_whole(name, tmp_path):
     other = deformer(name, CanonicalGrid(torch.full((3,), -3.0), torch.full((3,), 3.0)), seed=1)
     other.freeze()
     other.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-    assert torch.equal(other.active_cells, cells) and torch.equal(other.lower, module.lower)
+    assert torch.equal(other.active_cells, cells)
+    assert torch.equal(other.lower, module.lower)
     with torch.no_grad():
         assert torch.equal(other.weight_grid(), module.weight_grid())
         assert torch.equal(other.skinning_weights(canonical_points()), module.skinning_weights(canonical_points()))
@@ -86,7 +88,8 @@ def test_gradients_reach_the_parameters(name):
     found.canonical.square().sum().backward()
     assert bool((points.grad != 0).any())
     for parameter in module.parameters():
-        assert bool(parameter.grad.isfinite().all()) and bool((parameter.grad != 0).any())
+        assert bool(parameter.grad.isfinite().all())
+        assert bool((parameter.grad != 0).any())
     assert bool(list(module.parameters())) == (name != "preset")
 
 
@@ -96,7 +99,8 @@ def test_moves_to_another_dtype(name):
     module.double()
     transforms = random_transforms(1, BONES, 0.2)
     found = module(canonical_points(5).double()[None], transforms)
-    assert found.canonical.dtype == torch.float64 and len(found.query) >= 5
+    assert found.canonical.dtype == torch.float64
+    assert len(found.query) >= 5
 
 
 def stripes(x):
@@ -114,7 +118,8 @@ def test_a_function_of_the_users_own_is_the_field(name):
     assert float(error) < (1e-7 if name == "mlp" else 0.05)  # cells of 29 cm
     transforms = random_transforms(1, BONES, 0.2, dtype=torch.float32)
     found = module(module.skin(canonical, transforms[0])[None], transforms)
-    assert bool(found.found.all()) and not module.state_dict().keys() - {"lower", "upper", "active_cells"}
+    assert bool(found.found.all())
+    assert not module.state_dict().keys() - {"lower", "upper", "active_cells"}
 
 
 @pytest.mark.parametrize("name", ["distilled", "mlp"])
@@ -146,7 +151,8 @@ def test_cells_that_are_not_active_have_no_roots():
     assert module.is_active(torch.tensor([[0.9, 0.0, 0.0], [-0.9, 0.0, 0.0], [1.1, 0.0, 0.0]])).tolist() == [True, False, False]
     fewer = module(points, transforms)
     kept = module.is_active(everywhere.canonical)
-    assert 0 < int(kept.sum()) < len(kept) and torch.equal(fewer.query, everywhere.query[kept])
+    assert 0 < int(kept.sum()) < len(kept)
+    assert torch.equal(fewer.query, everywhere.query[kept])
 
 
 @pytest.mark.parametrize("name", ["distilled", "voxel"])
@@ -158,7 +164,8 @@ def test_a_search_evaluates_only_nodes_of_active_cells(name):
     with torch.no_grad():
         whole, some, variation = module.weight_grid(), module.weight_grid(active_only=True), float(module.smoothness())
     used = some.sum(-1) > 0
-    assert int(used.sum()) == 8 and bool(used[2:4, 3:5, 4:6].all())
+    assert int(used.sum()) == 8
+    assert bool(used[2:4, 3:5, 4:6].all())
     torch.testing.assert_close(some[used], whole[used])
     around = whole[2:4, 3:5, 4:6]
     changes = [around.diff(dim=axis).abs().sum(-1).mean() / (2 / cells) for axis, cells in enumerate((5, 6, 7))]
@@ -167,18 +174,18 @@ def test_a_search_evaluates_only_nodes_of_active_cells(name):
 
 def test_what_does_not_go_together_is_refused():
     grid = unit_grid(torch.float32)
-    with pytest.raises(ValueError, match="skinning.name must be one of distilled, voxel, mlp, preset, got 'grid'"):
+    with pytest.raises(ValueError, match=r"skinning.name must be one of distilled, voxel, mlp, preset, got 'grid'"):
         ForwardDeformer(grid, BONES, settings("grid"))
-    with pytest.raises(ValueError, match="needs field=PresetWeights.from_vertices"):
+    with pytest.raises(ValueError, match=r"needs field=PresetWeights.from_vertices"):
         ForwardDeformer(grid, BONES, settings("preset"))
     with pytest.raises(ValueError, match=r"field must have nodes \[6, 7, 9\] .* got \[6, 7, 8\]"):
         changed = settings("preset")
         changed.resolution = [9, 7, 6]
         ForwardDeformer(grid, BONES, changed, field=preset(grid))
-    with pytest.raises(ValueError, match="'mlp' needs search.name 'broyden', got 'complete'"):
+    with pytest.raises(ValueError, match=r"'mlp' needs search.name 'broyden', got 'complete'"):
         ForwardDeformer(grid, BONES, settings("mlp"), SearchConfig("complete"))
     module = deformer("mlp")
-    with pytest.raises(ValueError, match="'mlp' needs search.name 'broyden'"):
+    with pytest.raises(ValueError, match=r"'mlp' needs search.name 'broyden'"):
         module.search = SearchConfig("complete")
     with pytest.raises(ValueError, match=r"active_cells must be bool \[5, 6, 7\], got torch.float32 \[5, 6, 7\]"):
         module.set_active_cells(torch.ones(5, 6, 7))

@@ -51,7 +51,8 @@ def test_every_result_is_a_root_once_and_in_order(angle, start_jacobian):
     field, transforms = DistanceField(), random_transforms(3, BONES, angle)
     points = 2 * torch.rand(3, 150, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 1
     found = find_correspondences_on_field(points, transforms, field, tolerance=1e-9, start_jacobian=start_jacobian)
-    assert len(found.query) > 300 and int(found.total) == len(found.query)
+    assert len(found.query) > 300
+    assert int(found.total) == len(found.query)
     assert bool((found.query[1:] >= found.query[:-1]).all())
     residual = posed(found, field, transforms) - points.reshape(-1, 3)[found.query]
     assert float(residual.norm(dim=1).max()) < 1e-9
@@ -67,19 +68,22 @@ def test_roots_are_those_of_a_fine_grid(scene):
         weights = field(grid.nodes((81, 81, 81)).reshape(-1, 3)).reshape(81, 81, 81, BONES)
     wanted = find_correspondences(points, transforms, weights, grid)
     found = find_correspondences_on_field(points, transforms, field, grid=grid, tolerance=1e-9)
-    assert torch.equal(found.query, wanted.query) and len(found.query) >= 80
+    assert torch.equal(found.query, wanted.query)
+    assert len(found.query) >= 80
     # Cells of 2.5 cm: what the trilinear field leaves out
     torch.testing.assert_close(found.canonical, wanted.canonical, atol=2e-3, rtol=0)
     difference = (found.jacobian_inverse - wanted.jacobian_inverse).flatten(1).norm(dim=1)
     error = difference / wanted.jacobian_inverse.flatten(1).norm(dim=1)
-    assert float(error.median()) < 1e-2 and float(error.max()) < 0.1
+    assert float(error.median()) < 1e-2
+    assert float(error.max()) < 0.1
 
 
 def test_single_precision_is_as_good(scene):
     field, transforms, points = scene
     wanted = find_correspondences_on_field(points, transforms, field, tolerance=1e-9)
     found = find_correspondences_on_field(points.float(), transforms.float(), field)
-    assert found.canonical.dtype == torch.float32 and torch.equal(found.query, wanted.query)
+    assert found.canonical.dtype == torch.float32
+    assert torch.equal(found.query, wanted.query)
     torch.testing.assert_close(found.canonical.double(), wanted.canonical, atol=5e-6, rtol=0)
 
 
@@ -167,7 +171,8 @@ def test_works_wherever_autograd_is_off_and_under_autocast(scene):
     with torch.autocast("cpu", torch.bfloat16):
         cast = find_correspondences_on_field(points.float(), transforms.float(), field).canonical
     for other in (plain, inference):
-        assert not other.requires_grad and torch.equal(other, wanted)
+        assert not other.requires_grad
+        assert torch.equal(other, wanted)
     assert cast.dtype == torch.float32
     torch.testing.assert_close(cast.double(), wanted, atol=5e-6, rtol=0)
 
@@ -190,7 +195,9 @@ def test_points_without_a_root_and_points_that_are_none(scene):
     points[1, 5] = 1e6
     box = CanonicalGrid(torch.full((3,), -1.0), torch.full((3,), 1.0))
     found = find_correspondences_on_field(points, transforms, field, grid=box)
-    assert not bool(found.found[0, 3]) and not bool(found.found[1, 0]) and not bool(found.found[1, 5])
+    assert not bool(found.found[0, 3])
+    assert not bool(found.found[1, 0])
+    assert not bool(found.found[1, 5])
     assert int(found.found.sum()) == 77
     assert bool((found.canonical.abs() <= 1).all())
 
@@ -211,7 +218,8 @@ def test_start_bones_and_orientation():
     every = find_correspondences_on_field(points, transforms, field)
     one = find_correspondences_on_field(points, transforms, field, init_bones=[2])
     upright = find_correspondences_on_field(points, transforms, field, orientation_preserving=True)
-    assert len(one.query) < len(every.query) and bool((torch.bincount(one.query) <= 1).all())
+    assert len(one.query) < len(every.query)
+    assert bool((torch.bincount(one.query) <= 1).all())
     positive = torch.linalg.det(every.jacobian_inverse) > 0
     assert 0 < int(positive.sum()) < len(positive)
     assert torch.equal(upright.query, every.query[positive])
@@ -222,7 +230,8 @@ def test_few_points(batch, count):
     field, transforms = DistanceField(), random_transforms(batch, BONES, 0.2)
     points = torch.zeros(batch, count, 3, dtype=torch.float64, requires_grad=True)
     found = find_correspondences_on_field(points, transforms, field)
-    assert found.found.shape == (batch, count) and int(found.found.sum()) == batch * count * (count == 1)
+    assert found.found.shape == (batch, count)
+    assert int(found.found.sum()) == batch * count * (count == 1)
     found.canonical.sum().backward()
     assert points.grad.shape == points.shape
 

@@ -99,7 +99,8 @@ def test_branches_compete_only_where_they_part():
     moved[0, inner + 1] = 2.0
     before, after = softmax(logits)[0], softmax(moved)[0]
     torch.testing.assert_close(before[[0, 2, 4]], after[[0, 2, 4]])
-    assert after[1] > before[1] and after[3] < before[3]
+    assert after[1] > before[1]
+    assert after[3] < before[3]
 
 
 @pytest.mark.parametrize(
@@ -118,7 +119,7 @@ def test_what_is_no_tree_is_refused(parents, message):
 
 def test_choices_are_named():
     assert isinstance(make_softmax("plain", 3), PlainSoftmax)
-    with pytest.raises(ValueError, match="skinning.softmax must be one of plain, hierarchical, got 'soft'"):
+    with pytest.raises(ValueError, match=r"skinning.softmax must be one of plain, hierarchical, got 'soft'"):
         make_softmax("soft", 3)
     with pytest.raises(ValueError, match="needs parents"):
         make_softmax("hierarchical", 3)

@@ -123,7 +123,8 @@ def test_result_does_not_depend_on_threads_or_batch(search):
     poses = zip(points, transforms, strict=True)
     parts = [find_correspondences(p[None], t[None], weights, grid, search=search) for p, t in poses]
     for other in results[1:]:
-        assert torch.equal(results[0].canonical, other.canonical) and torch.equal(results[0].query, other.query)
+        assert torch.equal(results[0].canonical, other.canonical)
+        assert torch.equal(results[0].query, other.query)
     assert torch.equal(results[0].canonical, torch.cat([part.canonical for part in parts]))
     half = find_correspondences(points[:, :1500], transforms, weights, grid, search=search)
     first = results[0].query % 3000 < 1500
@@ -214,7 +215,8 @@ def test_lower_instruction_sets_find_the_same(name, tmp_path):
     same = counts[0] == counts[1]
     assert (~same).sum() <= 2
     distance = (mine.canonical[same[mine.query]] - canonical[same[query]]).norm(dim=1)
-    assert distance.max() < 1e-3 and distance.median() < 1e-6
+    assert distance.max() < 1e-3
+    assert distance.median() < 1e-6
 
 
 @pytest.mark.parametrize("scale", [1e3, 1e-3])
@@ -243,6 +245,7 @@ def test_a_cell_that_the_pose_collapses_gives_no_infinite_inverse(search, backen
     points = torch.tensor([[[1.0, 0.7, 0.6], [0.4, 0.7, 0.6], [1.5, 0.2, 0.6]]], dtype=torch.float64)
     weights.requires_grad_()
     found = find_correspondences(points, transforms, weights, grid, search=search, backend=backend)
-    assert found.jacobian_inverse.isfinite().all() and found.found[0, 1:].all()
+    assert found.jacobian_inverse.isfinite().all()
+    assert found.found[0, 1:].all()
     (gradient,) = torch.autograd.grad(found.canonical.sum(), weights)
     assert gradient.isfinite().all()

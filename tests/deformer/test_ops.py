@@ -143,14 +143,18 @@ def test_capacity_pads_or_cuts(backend):
     weights.requires_grad_()
     free = find_correspondences(points, transforms, weights, grid, backend=backend)
     roomy = find_correspondences(points, transforms, weights, grid, backend=backend, capacity=len(free.query) + 9)
-    assert len(roomy.query) == len(free.query) + 9 and int(roomy.total) == len(free.query)
-    assert torch.equal(roomy.canonical[:-9], free.canonical) and bool((roomy.query[-9:] == 60).all())
-    assert torch.equal(roomy.found, free.found) and torch.equal(roomy.padded()[0], free.padded()[0])
+    assert len(roomy.query) == len(free.query) + 9
+    assert int(roomy.total) == len(free.query)
+    assert torch.equal(roomy.canonical[:-9], free.canonical)
+    assert bool((roomy.query[-9:] == 60).all())
+    assert torch.equal(roomy.found, free.found)
+    assert torch.equal(roomy.padded()[0], free.padded()[0])
     assert torch.equal(roomy.maximum(roomy.canonical[:, 0], -9.0), free.maximum(free.canonical[:, 0], -9.0))
     gradients = [torch.autograd.grad(f.canonical.square().sum(), weights)[0] for f in (free, roomy)]
     assert torch.allclose(*gradients)
     tight = find_correspondences(points, transforms, weights, grid, backend=backend, capacity=5)
-    assert torch.equal(tight.canonical, free.canonical[:5]) and int(tight.total) == len(free.query)
+    assert torch.equal(tight.canonical, free.canonical[:5])
+    assert int(tight.total) == len(free.query)
 
 
 @pytest.mark.parametrize("backend", ["native", "reference"])
@@ -160,7 +164,8 @@ def test_an_empty_batch_has_no_gradient_to_give(backend):
     for capacity in (None, 7):
         empty = torch.empty(0, 5, 3, dtype=torch.float64), torch.empty(0, 4, 4, 4, dtype=torch.float64, requires_grad=True)
         found = find_correspondences(*empty, weights, unit_grid(), backend=backend, capacity=capacity)
-        assert int(found.total) == 0 and len(found.query) == (capacity or 0)
+        assert int(found.total) == 0
+        assert len(found.query) == (capacity or 0)
         (gradient,) = torch.autograd.grad(found.canonical.sum(), weights)
         assert not gradient.any()
 
@@ -171,13 +176,15 @@ def test_autocast_changes_nothing(backend):
     plain = find_correspondences(points, transforms, weights, unit_grid(torch.float32), backend=backend)
     with torch.autocast("cpu", torch.bfloat16):
         mixed = find_correspondences(points, transforms, weights, unit_grid(torch.float32), backend=backend)
-    assert torch.equal(plain.query, mixed.query) and torch.allclose(plain.canonical, mixed.canonical, atol=1e-6)
+    assert torch.equal(plain.query, mixed.query)
+    assert torch.allclose(plain.canonical, mixed.canonical, atol=1e-6)
 
 
 def test_the_inverse_carries_no_gradient():
     points, transforms, weights = scene(torch.float64)
     found = find_correspondences(points, transforms, weights.requires_grad_(), unit_grid())
-    assert found.canonical.requires_grad and not found.jacobian_inverse.requires_grad
+    assert found.canonical.requires_grad
+    assert not found.jacobian_inverse.requires_grad
     outputs = complete_search(*operator_arguments(requires_grad=True))
     assert [out.requires_grad for out in outputs] == [True, False, False, False]
 

@@ -36,7 +36,9 @@ SETTINGS = {"seed": 3, "split": "ood", "ckpt": None, "data": {"name": "builtin"}
 
 
 def test_table_reads_as_wanted():
-    assert table(EVALUATION) == """\
+    assert (
+        table(EVALUATION)
+        == """\
 fast_snarf of subject 50002, data builtin, out of distribution (ood)
 
                                         IoU %                 no correspondence %
@@ -48,6 +50,7 @@ handstand               1  100.00   100.00   95.50  100.00        0.00      0.00
 mean of sequences           97.88    93.00   95.50
 all frames              3   97.17    90.67   95.50   85.00       26.67      0.667
 bbox: the papers' cube; tight: the mesh's own box; worst: lowest surface IoU of a frame"""
+    )
 
 
 def test_table_fits_100_columns_whatever_the_names():
@@ -68,8 +71,7 @@ def test_numbers_stand_under_their_heads():
 def test_times_are_for_the_points_of_the_papers_table():
     # 3 frames of 1000 points take 3 ms + 12 ms + 3 ms of the rest; 200,000 points take 66.7 times as long
     assert timings_text(EVALUATION) == (
-        "time for 200,000 points: search 200.0 ms, shape 800.0 ms, total 1200.0 ms\n"
-        "3 frames in 1.5 s on cpu, 2 threads"
+        "time for 200,000 points: search 200.0 ms, shape 800.0 ms, total 1200.0 ms\n3 frames in 1.5 s on cpu, 2 threads"
     )
 
 

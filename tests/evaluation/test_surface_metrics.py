@@ -25,7 +25,8 @@ def test_points_are_spread_evenly():
 
 def test_equal_surfaces_are_equal():
     made = compare_surfaces(sphere(0.5), sphere(0.5), count=500)
-    assert made.chamfer_m < 1e-12 and made.f_score == 1.0
+    assert made.chamfer_m < 1e-12
+    assert made.f_score == 1.0
     assert made.normal_consistency == pytest.approx(1.0, abs=1e-9)
 
 

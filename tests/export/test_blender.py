@@ -49,7 +49,8 @@ def test_blender_gives_the_skinned_surface(tmp_path, suffix):
     surface = toy.skinned_surface(OPTIONS.resolution)
     for clip in clips:
         found = look(path, clip)
-        assert found["smooth"] and found["bones"] == [f"bone_{joint}" for joint in range(JOINTS)]
+        assert found["smooth"]
+        assert found["bones"] == [f"bone_{joint}" for joint in range(JOINTS)]
         assert len(found["shape_keys"]) == report.morph_targets or suffix == "usd"
         last = {end for name, (_, end) in found["clips"].items() if suffix == "usd" or name.split("|")[-1] == clip.motion.name}
         assert last == {clip.motion.num_frames - 1}
@@ -62,6 +63,6 @@ def test_blender_gives_the_skinned_surface(tmp_path, suffix):
 @needs_blender
 def test_a_file_that_blender_cannot_read_is_a_line(tmp_path):
     (tmp_path / "bad.glb").write_bytes(b"glTF and then nothing")
-    with pytest.raises(UserError, match="Blender could not write bad.fbx"):
+    with pytest.raises(UserError, match=r"Blender could not write bad.fbx"):
         convert(BLENDER, tmp_path / "bad.glb", tmp_path / "bad.fbx", 30.0)
     assert [path.name for path in tmp_path.iterdir()] == ["bad.glb"]

@@ -98,7 +98,8 @@ def test_eight_influences_leave_nothing_out(toy, tmp_path):
     """Six bones are all among eight influences, and three poses are two shapes and their mean: nothing is left."""
     motion = wave(3)
     report = export_character(toy, tmp_path / "worm.glb", [Clip(motion)], replace(WHOLE, influences=8))
-    assert report.truncation_mm["max_mm"] < 1e-3 and report.morph_error_mm["max_mm"] < 1e-2
+    assert report.truncation_mm["max_mm"] < 1e-3
+    assert report.morph_error_mm["max_mm"] < 1e-2
     reader = GlbReader(tmp_path / "worm.glb")
     assert reader.primitive.attributes.JOINTS_1 is not None
     np.testing.assert_allclose(reader.dense_weights().sum(1), 1, atol=1e-6)
@@ -116,11 +117,12 @@ def test_joints_that_stretch_and_grow(toy, tmp_path, scale):
         assert largest(reader.vertices("wave", frame / FRAME_RATE), posed(surface, clip, frame)) < allowed(report)
     paths = {(channel.target.node, channel.target.path) for channel in reader.clips["wave"].channels}
     assert ((reader.skin.joints[3], "scale") in paths) == (scale != 1)
-    assert (reader.skin.joints[3], "translation") in paths and (reader.skin.joints[2], "translation") not in paths
+    assert (reader.skin.joints[3], "translation") in paths
+    assert (reader.skin.joints[2], "translation") not in paths
 
 
 def test_the_nodes_are_the_skeleton(exported, toy):
-    path, _, _, clips = exported
+    path, _, _, _clips = exported
     reader = GlbReader(path)
     nodes = reader.gltf.nodes
     assert [nodes[joint].name for joint in reader.skin.joints] == list(toy.skeleton.names)
@@ -130,7 +132,8 @@ def test_the_nodes_are_the_skeleton(exported, toy):
     np.testing.assert_allclose(bind[:, :3, 3], toy.skeleton.canonical_joints, atol=1e-6)
     # standing nodes are the bind pose
     np.testing.assert_allclose([reader._world(joint, {}, {}) for joint in reader.skin.joints], bind, atol=1e-6)
-    assert nodes[reader.mesh_node].translation is None and reader.mesh_node not in reader.parents
+    assert nodes[reader.mesh_node].translation is None
+    assert reader.mesh_node not in reader.parents
 
 
 def test_clips_keep_their_times_and_the_way_of_the_root(exported):
@@ -166,7 +169,9 @@ def test_a_still_clip_is_as_long_as_it_was(toy, tmp_path):
     lengths = {tuple(np.round(reader.array(sampler.input), 5)) for sampler in reader.clips["wave"].samplers}
     assert lengths == {(0.0, round(8 / FRAME_RATE, 5))}
     report = export_character(toy, tmp_path / "b.glb", [Clip(motion)], FEW)  # a single pose
-    assert report.clips[0].frames == 1 and report.morph_targets == 0 and report.morph_share == 1
+    assert report.clips[0].frames == 1
+    assert report.morph_targets == 0
+    assert report.morph_share == 1
     surface = character_surface(toy, FEW)
     assert largest(GlbReader(tmp_path / "b.glb").vertices("wave", 0), posed(surface, Clip(motion), 0)) < allowed(report)
 
@@ -182,7 +187,8 @@ def test_a_decimated_mesh_stays_on_the_surface(toy, tmp_path):
     # Vertices are on the level set, but triangles of 3 cm cut corners of a tube of 6 cm: chords leave it by 1.5 mm.
     assert distance.max() < allowed(report) + 1.5e-3
     own = trimesh.Trimesh(reader.vertices("wave", 5 / FRAME_RATE), reader.faces(), process=False)
-    assert own.is_watertight and own.volume == pytest.approx(solid.volume, rel=0.03)
+    assert own.is_watertight
+    assert own.volume == pytest.approx(solid.volume, rel=0.03)
     normals = reader.attribute("NORMAL")
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
 
@@ -192,18 +198,22 @@ def test_more_targets_leave_less(toy, tmp_path):
     reports = [export_character(toy, tmp_path / f"{k}.glb", clips, replace(FEW, morph_targets=k)) for k in (0, 2, 4)]
     assert [report.morph_targets for report in reports] == [0, 2, 4]
     errors = [report.morph_error_mm["rms_mm"] for report in reports]
-    assert errors[0] == reports[0].shape_motion_mm["rms_mm"] and errors[0] > 2 * errors[1] > 4 * errors[2]
-    assert reports[0].morph_share == 0 and reports[2].morph_share > 0.99
+    assert errors[0] == reports[0].shape_motion_mm["rms_mm"]
+    assert errors[0] > 2 * errors[1] > 4 * errors[2]
+    assert reports[0].morph_share == 0
+    assert reports[2].morph_share > 0.99
     reader = GlbReader(tmp_path / "4.glb")
     assert reader.mesh.extras["targetNames"] == [f"shape_{number}" for number in range(4)]
     weights = np.stack([reader.values("wave", frame / FRAME_RATE)[reader.mesh_node, "weights"] for frame in range(13)])
-    assert weights.min() == 0 and weights.max() == 1  # sliders from 0 to 1
+    assert weights.min() == 0
+    assert weights.max() == 1
     assert GlbReader(tmp_path / "0.glb").primitive.targets in (None, [])
 
 
 def test_an_avatar_of_one_shape_needs_no_targets(tmp_path):
     report = export_character(ToyCharacter(bulge=0.0), tmp_path / "worm.glb", [Clip(wave())], FEW)
-    assert report.morph_targets == 0 and report.morph_error_mm["max_mm"] < 0.02
+    assert report.morph_targets == 0
+    assert report.morph_error_mm["max_mm"] < 0.02
 
 
 def test_colors_are_linear(toy, tmp_path):
@@ -219,13 +229,14 @@ def test_colors_are_linear(toy, tmp_path):
 
 
 def test_other_readers_of_python(exported):
-    path, _, surface, clips = exported
+    path, _, surface, _clips = exported
     scene = trimesh.load(path)
     (solid,) = scene.geometry.values()
     assert solid.faces.shape == surface.mesh.faces.shape
     rig = read_gltf(path)
     assert [(clip.frame_rate, len(clip.world_from_joint)) for clip in rig.clips] == [(FRAME_RATE, 13), (60, 31)]
-    assert [clip.name for clip in rig.clips] == ["wave", "fast"] and rig.names == tuple(f"bone_{j}" for j in range(JOINTS))
+    assert [clip.name for clip in rig.clips] == ["wave", "fast"]
+    assert rig.names == tuple(f"bone_{j}" for j in range(JOINTS))
     reader = GlbReader(path)
     assert rig.clips[0].world_from_joint.shape == (13, JOINTS, 4, 4)
     for joint, number in enumerate(reader.skin.joints):
@@ -241,7 +252,8 @@ def test_the_khronos_validator_has_nothing_to_say(toy, tmp_path, options):
     export_character(toy, tmp_path / "worm.glb", clips, options)
     report = run_reader("validate.mjs", tmp_path / "worm.glb")
     assert report["issues"]["messages"] == []
-    assert report["info"]["animationCount"] == 3 and report["info"]["maxInfluences"] == options.influences
+    assert report["info"]["animationCount"] == 3
+    assert report["info"]["maxInfluences"] == options.influences
 
 
 @needs_readers
@@ -292,11 +304,12 @@ def test_whole_or_not_at_all(toy, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     monkeypatch.undo()
     path.write_bytes(b"mine")
-    with pytest.raises(UserError, match="worm.glb is there already; give overwrite=true"):
+    with pytest.raises(UserError, match=r"worm.glb is there already; give overwrite=true"):
         export_character(toy, path, [Clip(wave(2))], FEW)
     assert path.read_bytes() == b"mine"
     export_character(toy, path, [Clip(wave(2))], FEW, overwrite=True)
-    assert list(tmp_path.iterdir()) == [path] and path.read_bytes()[:4] == b"glTF"
+    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_bytes()[:4] == b"glTF"
 
 
 @pytest.mark.parametrize(
@@ -319,7 +332,9 @@ def test_without_weights_or_motions_there_is_no_character(toy, tmp_path, monkeyp
     with pytest.raises(UserError, match="no motion to export"):
         export_character(toy, tmp_path / "worm.glb", [], FEW)
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
-    with pytest.raises(UserError, match="a rig needs skinning weights of canonical points, which model fast_snarf does not have"):
+    with pytest.raises(
+        UserError, match="a rig needs skinning weights of canonical points, which model fast_snarf does not have"
+    ):
         export_character(toy, tmp_path / "worm.glb", [Clip(wave(2))], FEW)
 
 

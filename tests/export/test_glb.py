@@ -13,9 +13,12 @@ def chunks(content: bytes) -> tuple[dict, bytes]:
     """Take a file apart after the specification, chapter 4."""
     assert struct.unpack_from("<III", content) == (0x46546C67, 2, len(content))
     length, kind = struct.unpack_from("<II", content, 12)
-    assert kind == 0x4E4F534A and length % 4 == 0
+    assert kind == 0x4E4F534A
+    assert length % 4 == 0
     rest, kind = struct.unpack_from("<II", content, 20 + length)
-    assert kind == 0x004E4942 and rest % 4 == 0 and 28 + length + rest == len(content)
+    assert kind == 0x004E4942
+    assert rest % 4 == 0
+    assert 28 + length + rest == len(content)
     return json.loads(content[20 : 20 + length]), content[28 + length :]
 
 
@@ -26,14 +29,18 @@ def test_arrays_are_aligned_and_described():
     matrices = builder.array(np.arange(16.0).reshape(1, 4, 4))
     shares = builder.array([[65535, 0]], "uint16", normalized=True)
     root, binary = chunks(builder.to_bytes())
-    assert root["asset"]["version"] == "2.0" and root["asset"]["extras"] == {"made": "by a test"}
+    assert root["asset"]["version"] == "2.0"
+    assert root["asset"]["extras"] == {"made": "by a test"}
     assert root["buffers"] == [{"byteLength": len(binary)}]
     views, accessors = root["bufferViews"], root["accessors"]
     assert all(view["byteOffset"] % 4 == 0 for view in views)
     assert accessors[numbers] == {"bufferView": 0, "componentType": 5121, "count": 3, "type": "SCALAR"}
-    assert accessors[places]["min"] == [-1, 2, 2.5] and accessors[places]["max"] == [1, 5, 3]
-    assert views[places]["target"] == 34962 and "target" not in views[numbers]
-    assert accessors[shares]["type"] == "VEC2" and accessors[shares]["normalized"] is True
+    assert accessors[places]["min"] == [-1, 2, 2.5]
+    assert accessors[places]["max"] == [1, 5, 3]
+    assert views[places]["target"] == 34962
+    assert "target" not in views[numbers]
+    assert accessors[shares]["type"] == "VEC2"
+    assert accessors[shares]["normalized"] is True
     start = views[matrices]["byteOffset"]
     columns = np.frombuffer(binary, "<f4", 16, start)  # 3.6.2.4: matrices by columns
     np.testing.assert_array_equal(columns.reshape(4, 4).T, np.arange(16).reshape(4, 4))
@@ -41,7 +48,8 @@ def test_arrays_are_aligned_and_described():
 
 def test_objects_leave_out_what_is_none():
     builder = GlbBuilder()
-    assert builder.add("nodes", name="a", children=None) == 0 and builder.add("nodes", name="b") == 1
+    assert builder.add("nodes", name="a", children=None) == 0
+    assert builder.add("nodes", name="b") == 1
     assert builder.root["nodes"] == [{"name": "a"}, {"name": "b"}]
     assert "extras" not in builder.root["asset"]
 

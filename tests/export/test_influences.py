@@ -30,9 +30,12 @@ def largest_weights(count: int) -> np.ndarray:
 @pytest.mark.parametrize(("count", "share"), [(2, 0.8), (4, 0.6)])
 def test_fitted_weights_are_better_than_the_largest(count, share):
     joints, weights = few_influences(MESH.weights, count, MESH.vertices, *TRIALS)
-    assert joints.shape == weights.shape == (len(MESH.vertices), count) and weights.dtype == np.float32
+    assert joints.shape == weights.shape == (len(MESH.vertices), count)
+    assert weights.dtype == np.float32
     np.testing.assert_allclose(weights.sum(1, dtype=np.float64), 1, atol=2e-7 * count)  # as the validator wants it
-    assert weights.min() >= 0 and (np.diff(weights, axis=1) <= 0).all() and (joints[weights == 0] == 0).all()
+    assert weights.min() >= 0
+    assert (np.diff(weights, axis=1) <= 0).all()
+    assert (joints[weights == 0] == 0).all()
     dense = dense_weights(joints, weights, MESH.weights.shape[1])
     assert rms_mm(dense, CLIP) < share * rms_mm(largest_weights(count), CLIP)
     other = clip_transforms(TOY.skeleton, Clip(wave(turn=-1.0)))  # a motion they were not made for
@@ -48,7 +51,8 @@ def test_weights_that_are_few_stay_as_they_are():
 
 def test_more_columns_than_joints_are_zeros():
     joints, values = few_influences(MESH.weights, 8, MESH.vertices, *TRIALS)
-    assert joints.shape[1] == 8 and (values[:, 6:] == 0).all()
+    assert joints.shape[1] == 8
+    assert (values[:, 6:] == 0).all()
     np.testing.assert_allclose(dense_weights(joints, values, 6), MESH.weights, atol=1e-6)
 
 

@@ -43,7 +43,8 @@ def test_weights_within_0_and_1_give_the_same_shapes():
     joined = np.concatenate(weights)
     np.testing.assert_allclose(joined.min(0), 0, atol=1e-6)
     np.testing.assert_allclose(joined.max(0), 1, atol=1e-6)
-    assert joined.min() >= 0 and joined.max() <= 1
+    assert joined.min() >= 0
+    assert joined.max() <= 1
     for old, new in zip(np.concatenate(clips), joined, strict=True):
         np.testing.assert_allclose(scaled.shape(new), basis.shape(old), atol=1e-6)
     np.testing.assert_allclose(scaled.shape(scaled.rest), given.mean(0), atol=1e-6)
@@ -54,7 +55,8 @@ def test_weights_within_0_and_1_give_the_same_shapes():
 @pytest.mark.parametrize("given", [shapes(1), np.repeat(shapes(1), 5, 0)])
 def test_one_shape_has_no_components(given):
     basis = fit_shapes(given, 4)
-    assert basis.targets.shape == (0, given.shape[1], 3) and basis.weights(given[0]).shape == (0,)
+    assert basis.targets.shape == (0, given.shape[1], 3)
+    assert basis.weights(given[0]).shape == (0,)
     np.testing.assert_array_equal(basis.shape(basis.weights(given[0])), given[0])
     assert basis.within_unit_range([np.zeros((5, 0))])[0] is basis
 
@@ -62,7 +64,9 @@ def test_one_shape_has_no_components(given):
 def test_frames_are_spread_over_all_clips():
     assert spread_frames([3], 10) == [(0, 0), (0, 1), (0, 2)]
     picked = spread_frames([300, 100, 1], 40)
-    assert len(picked) == 40 and picked[0] == (0, 5) and picked[-1] == (1, 95)
+    assert len(picked) == 40
+    assert picked[0] == (0, 5)
+    assert picked[-1] == (1, 95)
     assert set(np.diff([frame + 300 * clip for clip, frame in picked])) <= {10, 11}
     assert spread_frames([9], 1) == [(0, 4)]
 
@@ -70,7 +74,8 @@ def test_frames_are_spread_over_all_clips():
 def test_many_short_clips_are_seen_in_their_middle():
     assert spread_frames([5] * 4, 4) == [(clip, 2) for clip in range(4)]
     picked = spread_frames([10] * 200, 150)
-    assert len(picked) == 150 == len({clip for clip, _ in picked}) and len({frame for _, frame in picked}) == 3
+    assert len(picked) == 150 == len({clip for clip, _ in picked})
+    assert len({frame for _, frame in picked}) == 3
 
 
 def test_deviation_is_over_all_that_came():

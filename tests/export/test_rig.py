@@ -56,7 +56,8 @@ def test_scale_and_stretch_survive(scale):
     wanted = clip_transforms(TOY.skeleton, clip) @ bind_frames(TOY.skeleton)
     local = decompose(local_frames(wanted, PARENTS))
     np.testing.assert_allclose(recompose(local, PARENTS), wanted, atol=1e-6)
-    assert local.scale[-1, 3] == pytest.approx([scale] * 3) and local.scale[-1, 4] == pytest.approx([1] * 3)
+    assert local.scale[-1, 3] == pytest.approx([scale] * 3)
+    assert local.scale[-1, 4] == pytest.approx([1] * 3)
 
 
 def test_rounding_of_float32_is_no_scale():
@@ -71,7 +72,8 @@ def test_shear_is_left_out():
     local[0, 0, 0, 1] = 0.2
     again = recompose(decompose(local), (-1,))
     columns = again[0, 0, :3, :3]
-    assert abs(columns[:, 0] @ columns[:, 1]) < 1e-9 and np.abs(again - local).max() < 0.2
+    assert abs(columns[:, 0] @ columns[:, 1]) < 1e-9
+    assert np.abs(again - local).max() < 0.2
 
 
 def test_skinning_is_the_avatars():

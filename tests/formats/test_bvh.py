@@ -69,11 +69,14 @@ def shift(*offset):
 def test_joints_and_world_transforms_are_those_of_the_format(tmp_path):
     rig = read_bvh(write(tmp_path, ARM + FRAMES))
     assert rig.names == ("Hips", "Arm", "Hand", "Hand_end", "Leg")
-    assert rig.parents == (-1, 0, 1, 2, 0) and rig.mesh is None
+    assert rig.parents == (-1, 0, 1, 2, 0)
+    assert rig.mesh is None
     np.testing.assert_allclose(rig.rest[:, :3, 3], [[1, 2, 3], [1, 12, 3], [6, 12, 3], [6.5, 12.25, 3], [1, -6, 4]])
     np.testing.assert_array_equal(rig.rest[:, :3, :3], np.tile(np.eye(3), (5, 1, 1)))
     (clip,) = rig.clips
-    assert clip.name == "walk" and clip.frame_rate == 120.0 and clip.world_from_joint.shape == (2, 5, 4, 4)
+    assert clip.name == "walk"
+    assert clip.frame_rate == 120.0
+    assert clip.world_from_joint.shape == (2, 5, 4, 4)
     hips = shift(0, 90, 1.5) @ turn("z", 10) @ turn("x", 20) @ turn("y", 30)
     arm = hips @ shift(0, 10, 0) @ turn("y", -40) @ turn("z", 50) @ turn("x", 60)
     hand = arm @ shift(6, 0, 0) @ turn("z", 70)
@@ -119,7 +122,8 @@ def test_every_order_of_rotations(tmp_path, order):
 )  # fmt: skip
 def test_odd_layouts_are_the_same_motion(tmp_path, change):
     plain, odd = read_bvh(write(tmp_path, ARM + FRAMES)), read_bvh(write(tmp_path, change(ARM + FRAMES), "odd.bvh"))
-    assert odd.parents == plain.parents and [n.lower() for n in odd.names] == [n.lower() for n in plain.names]
+    assert odd.parents == plain.parents
+    assert [n.lower() for n in odd.names] == [n.lower() for n in plain.names]
     np.testing.assert_allclose(odd.rest, plain.rest)
     np.testing.assert_allclose(odd.clips[0].world_from_joint, plain.clips[0].world_from_joint, atol=1e-12)
     assert odd.clips[0].frame_rate == 120
@@ -139,7 +143,8 @@ def test_two_roots(tmp_path):
     root = "ROOT {} {{ OFFSET 1 0 0 CHANNELS 1 Zrotation JOINT b {{ OFFSET 1 0 0 CHANNELS 0 }} }}\n"
     text = "HIERARCHY\n" + root.format("a") + root.format("c") + "MOTION\nFrames: 1\nFrame Time: 1\n90 0\n"
     rig = read_bvh(write(tmp_path, text))
-    assert rig.names == ("a", "b", "c", "b_2") and rig.parents == (-1, 0, -1, 2)
+    assert rig.names == ("a", "b", "c", "b_2")
+    assert rig.parents == (-1, 0, -1, 2)
     expected = [[1, 0, 0], [1, 1, 0], [1, 0, 0], [2, 0, 0]]
     np.testing.assert_allclose(rig.clips[0].world_from_joint[0, :, :3, 3], expected, atol=1e-15)
 
@@ -210,7 +215,8 @@ def test_broken_files_end_in_one_line(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(UserError, match=message) as caught:
         read_bvh(path)
-    assert str(caught.value).isprintable() and str(path) in str(caught.value)
+    assert str(caught.value).isprintable()
+    assert str(path) in str(caught.value)
 
 
 def test_missing_files(tmp_path):

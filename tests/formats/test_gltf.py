@@ -77,12 +77,15 @@ def _posed(rig, clip, frame):
 
 def test_armature_scale_and_axes_are_undone(tmp_path):
     rig = _read(tmp_path, _two_bones())
-    assert rig.names == ("bone", "bone_2") and rig.parents == (-1, 0)  # the file lists the child first
+    assert rig.names == ("bone", "bone_2")
+    assert rig.parents == (-1, 0)
     np.testing.assert_allclose(rig.rest[:, :3, 3], [[0, 0.5, 0], [0, 0, 0]], atol=1e-6)
     np.testing.assert_allclose(np.sort(rig.mesh.vertices, 0)[[0, -1]], [[-0.1, 0, -0.1], [0.1, 1, 0.1]], atol=1e-6)
     assert trimesh.Trimesh(rig.mesh.vertices, rig.mesh.faces, process=False).volume == pytest.approx(0.04)
     (clip,) = rig.clips
-    assert clip.name == "clip_0" and clip.frame_rate == 30 and clip.world_from_joint.shape == (31, 2, 4, 4)
+    assert clip.name == "clip_0"
+    assert clip.frame_rate == 30
+    assert clip.world_from_joint.shape == (31, 2, 4, 4)
     np.testing.assert_allclose(_posed(rig, clip, 0), rig.mesh.vertices, atol=1e-6)
     turned = rig.mesh.vertices @ Rotation.from_euler("y", 90, degrees=True).as_matrix().T  # z up in the file is y up here
     np.testing.assert_allclose(_posed(rig, clip, 30), turned, atol=1e-6)
@@ -174,7 +177,7 @@ def test_two_skins_of_the_same_joints_are_joined(tmp_path):
     first[1, 2, 3] = -50
     root["skins"].append({"joints": [3, 1], "inverseBindMatrices": builder.array(first @ bind)})
     attributes = {
-        "POSITION": builder.array(_BOX.vertices + [1, 0.5, 0]),
+        "POSITION": builder.array([*_BOX.vertices, 1, 0.5, 0]),
         "JOINTS_0": builder.array([[1, 0, 0, 0]] * 8, "uint16"),
         "WEIGHTS_0": builder.array([[1, 0, 0, 0]] * 8),
     }
@@ -183,7 +186,8 @@ def test_two_skins_of_the_same_joints_are_joined(tmp_path):
     root["nodes"].append({"mesh": 1, "skin": 1})
     root["scenes"][0]["nodes"].append(5)
     rig = _read(tmp_path, builder)
-    assert rig.mesh.vertices.shape == (16, 3) and len(rig.names) == 2
+    assert rig.mesh.vertices.shape == (16, 3)
+    assert len(rig.names) == 2
     np.testing.assert_allclose(np.sort(rig.mesh.vertices, 0)[[0, -1]], [[-0.1, 0, -0.1], [1.1, 1, 0.1]], atol=1e-6)
     vertices, _ = _read(tmp_path, builder, read_gltf_surface)
     np.testing.assert_allclose(np.sort(vertices, 0), np.sort(rig.mesh.vertices, 0), atol=1e-6)
@@ -220,8 +224,10 @@ def _robot(**more):
 
 def test_robot_of_rigid_parts(tmp_path):
     rig = _read(tmp_path, _robot(), frame_rate=4.0)
-    assert rig.names == ("base", "arm", "hand") and rig.parents == (-1, 0, 1)
-    assert rig.mesh.vertices.shape == (16, 3) and set(np.unique(rig.mesh.weights)) == {0.0, 1.0}
+    assert rig.names == ("base", "arm", "hand")
+    assert rig.parents == (-1, 0, 1)
+    assert rig.mesh.vertices.shape == (16, 3)
+    assert set(np.unique(rig.mesh.weights)) == {0.0, 1.0}
     # The second box is mirrored, and must not be inside out.
     assert trimesh.Trimesh(rig.mesh.vertices, rig.mesh.faces, process=False).volume == pytest.approx(0.08)
     (clip,) = rig.clips
@@ -318,9 +324,10 @@ def test_buffers_elsewhere_are_refused(uri, tmp_path):
     (tmp_path / "a.bin").write_bytes(b"\0" * 10_000)
     os.mkfifo(folder / "pipe")
     (folder / "file.gltf").write_bytes(_two_bones().gltf(uri or " "))
-    with pytest.raises(UserError, match="same folder|missing|not a file|cannot be opened") as error:
+    with pytest.raises(UserError, match=r"same folder|missing|not a file|cannot be opened") as error:
         read_gltf(folder / "file.gltf")
-    assert "file.gltf" in str(error.value) and str(error.value).isprintable()
+    assert "file.gltf" in str(error.value)
+    assert str(error.value).isprintable()
 
 
 def _edited(edit):
@@ -394,7 +401,8 @@ _SAMPLER = (0, "samplers", 0)
 def test_broken_files_are_refused(edit, message, tmp_path):
     with pytest.raises(UserError, match=message) as error:
         _read(tmp_path, _edited(edit))
-    assert "file.glb" in str(error.value) and str(error.value).isprintable()
+    assert "file.glb" in str(error.value)
+    assert str(error.value).isprintable()
 
 
 @pytest.mark.parametrize(
@@ -470,7 +478,8 @@ def _turning(times, extras=None, *, ends=None, count=1):
 )  # fmt: skip
 def test_clips_keep_their_own_frame_rate(tmp_path, times, extras, ends, rate, frames):
     (clip,) = _read(tmp_path, _turning(times, extras, ends=ends)).clips
-    assert clip.frame_rate == pytest.approx(rate, rel=1e-6) and len(clip.world_from_joint) == frames
+    assert clip.frame_rate == pytest.approx(rate, rel=1e-6)
+    assert len(clip.world_from_joint) == frames
 
 
 def test_a_rate_that_makes_too_many_samples_gives_way_to_the_usual(tmp_path):

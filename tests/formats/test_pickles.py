@@ -34,7 +34,9 @@ def refusal(data: bytes, folder: Path) -> str:
     with pytest.raises(UserError) as caught:
         read(data, folder)
     message = str(caught.value)
-    assert message.startswith(f"body {folder / 'model.pkl'} ") and message.isprintable() and len(message) < 500
+    assert message.startswith(f"body {folder / 'model.pkl'} ")
+    assert message.isprintable()
+    assert len(message) < 500
     return message
 
 
@@ -53,7 +55,9 @@ def plain() -> dict:
 def test_plain_data_of_python_3(protocol, tmp_path):
     got = read(pickle.dumps(plain(), protocol), tmp_path)
     assert got == plain()
-    assert list(got["ordered"]) == ["b", "a"] and type(got["array"]) is float and type(got["flags"][0]) is bool
+    assert list(got["ordered"]) == ["b", "a"]
+    assert type(got["array"]) is float
+    assert type(got["flags"][0]) is bool
     assert read(pickle.dumps(1.5, protocol) + b"more", tmp_path) == 1.5
 
 
@@ -65,9 +69,12 @@ def test_arrays(protocol, tmp_path):
     arrays += [np.zeros((0, 3)), np.array(5), np.array(["a", "bcd"]), np.array([b"x", b"yz"]), np.arange(20)[::3]]
     arrays += [rng.random((3, 4)).T, np.asfortranarray(rng.random((4, 5)))]
     for got, wanted in zip(read(pickle.dumps(arrays, protocol), tmp_path), arrays, strict=True):
-        assert got.shape == wanted.shape and got.dtype == wanted.dtype.newbyteorder("=")
+        assert got.shape == wanted.shape
+        assert got.dtype == wanted.dtype.newbyteorder("=")
         np.testing.assert_array_equal(got, wanted)
-        assert got.flags.aligned and got.flags.writeable and got.dtype.isnative
+        assert got.flags.aligned
+        assert got.flags.writeable
+        assert got.dtype.isnative
     assert read(pickle.dumps(np.array([1, "a", None, [2]], object), protocol), tmp_path) == [1, "a", None, [2]]
 
 
@@ -92,7 +99,8 @@ def test_files_of_python_2_and_chumpy(protocol):
     np.testing.assert_array_equal(got["J_regressor"].toarray()[0], [0, 0, 0, 0.5, 0.25, 0.25])
     np.testing.assert_array_equal(got["J_regressor_prior"].toarray(), np.eye(2, 6))
     np.testing.assert_array_equal(got["kintree_table"], np.array([[2**32 - 1, 0], [0, 1]], np.uint32))
-    assert got["v_template"][2].tolist() == [0, 1, 0] and got["bs_type"] == "lrotmin"
+    assert got["v_template"][2].tolist() == [0, 1, 0]
+    assert got["bs_type"] == "lrotmin"
     assert got["pose_training_info"] == {"scans": 3.0, "ids": {1, 2}}
 
 
@@ -218,7 +226,8 @@ def test_bombs_end_in_one_line(case, tmp_path):
     seconds, peak = time.perf_counter() - start, tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     # Not a measure of speed: a hang would take minutes. Half a million steps under tracemalloc take some seconds.
-    assert seconds < 30 and peak < 2**29
+    assert seconds < 30
+    assert peak < 2**29
 
 
 def test_memo_numbers_cost_nothing(tmp_path):
@@ -281,4 +290,5 @@ def test_random_steps_are_read_or_refused(tmp_path):
         try:
             read(body + b".", tmp_path)
         except UserError as error:
-            assert "model.pkl" in str(error) and str(error).isprintable()
+            assert "model.pkl" in str(error)
+            assert str(error).isprintable()

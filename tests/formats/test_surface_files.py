@@ -44,7 +44,8 @@ def test_what_trimesh_writes_is_read_as_trimesh_reads_it(suffix, options, tmp_pa
     theirs = trimesh.load(path, force="mesh", process=False)
     # trimesh rounds the text of PLY files to float32
     np.testing.assert_allclose(vertices[faces], theirs.vertices[theirs.faces], atol=1e-7)
-    assert vertices.shape == _BALL.vertices.shape and _is_closed((vertices, faces))
+    assert vertices.shape == _BALL.vertices.shape
+    assert _is_closed((vertices, faces))
     if suffix not in (".stl", ".glb"):  # of the others the order is kept
         np.testing.assert_allclose(vertices, _BALL.vertices, atol=1e-6)
         np.testing.assert_array_equal(faces, _BALL.faces)
@@ -102,7 +103,8 @@ def test_closed_surface_that_was_split_along_seams_is_closed_again(suffix, tmp_p
     corners[::2][np.abs(corners[::2]) < 1e-12] = -0.0
     split = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
     surface = read_surface(_write(tmp_path, f"a.{suffix}", split.export(file_type=suffix)))
-    assert len(surface[0]) == len(_BALL.vertices) and _is_closed(surface)
+    assert len(surface[0]) == len(_BALL.vertices)
+    assert _is_closed(surface)
 
 
 def test_closed_surface_with_touching_vertices_stays_as_it_is(tmp_path):
@@ -111,7 +113,8 @@ def test_closed_surface_with_touching_vertices_stays_as_it_is(tmp_path):
         for face in ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)):
             lines += b"f %d %d %d\n" % tuple(start + corner for corner in face)
     vertices, faces = read_surface(_write(tmp_path, "a.obj", lines))
-    assert vertices.shape == (9, 3) and faces.max() == 7  # the vertex without faces is kept too
+    assert vertices.shape == (9, 3)
+    assert faces.max() == 7
 
 
 def _ply(order, faces, face_property="property list uchar int vertex_indices", vertex_type="float"):
@@ -193,7 +196,8 @@ _FACES = "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
 def test_broken_files_are_refused(name, content, message, tmp_path):
     with pytest.raises(UserError, match=message) as error:
         read_surface(_write(tmp_path, name, content))
-    assert name in str(error.value) and str(error.value).isprintable()
+    assert name in str(error.value)
+    assert str(error.value).isprintable()
 
 
 def test_missing_file_and_folder_are_refused(tmp_path):

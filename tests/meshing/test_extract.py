@@ -28,7 +28,8 @@ def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
 
 def assert_closed(mesh: Mesh) -> trimesh.Trimesh:
     solid = as_trimesh(mesh)
-    assert solid.is_watertight and solid.is_winding_consistent
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
     assert solid.area_faces.min() > 0
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
     assert set(np.unique(mesh.faces)) == set(range(len(mesh.vertices)))
@@ -52,7 +53,8 @@ def test_volume_and_area_converge(field, volume, area, euler):
     errors = np.array(errors)
     # second order: a quarter of the error at half the voxel, 0.35 leaves room for where the lattice falls
     assert (errors[1:] < 0.35 * errors[:-1]).all()
-    assert solid.volume > 0 and errors[-1].max() < 2e-3
+    assert solid.volume > 0
+    assert errors[-1].max() < 2e-3
 
 
 def test_coarse_to_fine_equals_the_full_lattice():
@@ -78,7 +80,8 @@ def test_few_points_are_evaluated_and_counted():
 
     mesh = extract_surface(counted, *BOX, 256, chunk=100_000)
     assert mesh.stats.points == sum(asked) < 257**3 / 12
-    assert mesh.stats.calls == len(asked) and max(asked) <= 100_000
+    assert mesh.stats.calls == len(asked)
+    assert max(asked) <= 100_000
     assert mesh.stats.voxel == pytest.approx(2 / 256)
 
 
@@ -180,7 +183,8 @@ def test_a_box_that_is_too_small_widens_where_it_must():
     exact = extract_surface(sphere, *BOX, 64, coarse=16, widen=True)
     np.testing.assert_array_equal(exact.vertices, extract_surface(sphere, *BOX, 64, coarse=16).vertices)
     endless = extract_surface(lambda p: 0.5 - p[:, 1:].norm(dim=1), *BOX, 32, widen=True)
-    assert endless.stats.capped and np.ptp(endless.vertices[:, 0]) < 5.2
+    assert endless.stats.capped
+    assert np.ptp(endless.vertices[:, 0]) < 5.2
 
 
 def test_a_thin_part_that_leaves_the_box_between_coarse_nodes_is_followed():
@@ -202,7 +206,8 @@ def test_refinement_removes_terraces():
         np.abs(np.linalg.norm(extract_surface(steep, *BOX, 32, refine=refine).vertices, axis=1) - 0.8).max()
         for refine in (0, 1, 3)
     ]
-    assert distance[1] < 0.5 * distance[0] and distance[2] < 0.1 * distance[0]
+    assert distance[1] < 0.5 * distance[0]
+    assert distance[2] < 0.1 * distance[0]
 
 
 def test_no_surface_is_a_clear_error():

@@ -17,7 +17,9 @@ def test_any_signs_give_closed_manifolds(zeros):
     vertices = crossings.node_a.astype(float)
     vertices[np.arange(len(vertices)), crossings.axis] += 0.5
     solid = trimesh.Trimesh(vertices, crossings.faces, process=False)
-    assert solid.is_watertight and solid.is_winding_consistent and solid.volume > 0
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
+    assert solid.volume > 0
     assert len(np.unique(vertices, axis=0)) == len(vertices)
     assert ((crossings.value_a > 0) != (crossings.value_b > 0)).all()
 
@@ -26,6 +28,7 @@ def test_one_node_is_an_octahedron():
     values = -np.ones((3, 3, 3), np.float32)
     values[1, 1, 1] = 3.0
     crossings = march(values)
-    assert len(crossings.faces) == 8 and len(crossings.axis) == 6
+    assert len(crossings.faces) == 8
+    assert len(crossings.axis) == 6
     assert sorted(np.bincount(crossings.axis)) == [2, 2, 2]
     assert set(np.stack([crossings.value_a, crossings.value_b]).ravel()) == {3.0, -1.0}

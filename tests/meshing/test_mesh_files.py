@@ -15,7 +15,7 @@ def ball(colors: bool, normals: bool) -> Mesh:
     solid = trimesh.creation.icosphere(subdivisions=2, radius=0.7)
     rng = np.random.default_rng(0)
     mesh = Mesh(
-        solid.vertices + [0.1, -0.2, 3.0],
+        [*solid.vertices, 0.1, -0.2, 3.0],
         solid.faces,
         colors=rng.integers(0, 256, solid.vertices.shape) if colors else None,
     )
@@ -33,7 +33,8 @@ def test_independent_readers_read_back(tmp_path, suffix, colors, normals):
     loaded = trimesh.load(path, process=False, maintain_order=True)
     np.testing.assert_allclose(loaded.vertices, mesh.vertices, atol=1e-6)  # 7 digits of 3 m
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
-    assert loaded.is_watertight and loaded.volume > 0
+    assert loaded.is_watertight
+    assert loaded.volume > 0
     assert (loaded.visual.kind == "vertex") == colors
     if colors:
         assert np.abs(loaded.visual.vertex_colors[:, :3].astype(int) - mesh.colors).max() <= 1

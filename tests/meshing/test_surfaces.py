@@ -25,7 +25,8 @@ def solid_of(mesh) -> trimesh.Trimesh:
 def test_straight_surfaces_agree_with_the_capsule():
     for surface in ("field", "skinned"):
         solid = solid_of(posed_mesh(ToyAvatar(), bent(0.0), resolution=96, surface=surface))
-        assert solid.is_watertight and solid.volume == pytest.approx(VOLUME, rel=0.01)
+        assert solid.is_watertight
+        assert solid.volume == pytest.approx(VOLUME, rel=0.01)
 
 
 def test_given_transforms_take_the_place_of_the_poses():
@@ -43,7 +44,8 @@ def test_field_and_skinned_surface_coincide_when_bent():
     avatar, shift = ToyAvatar(), torch.tensor([0.3, -2.0, 5.0])
     field = field_surface(avatar, bent(0.9), shift, 96)
     skinned = posed_mesh(avatar, bent(0.9), shift, 96, surface="skinned")
-    assert solid_of(field).is_watertight and solid_of(skinned).is_watertight
+    assert solid_of(field).is_watertight
+    assert solid_of(skinned).is_watertight
     # distance along the normal to the other surface's nearest vertex, at most a quarter of a voxel
     nearest = cKDTree(skinned.vertices).query(field.vertices)[1]
     offset = np.einsum("vk,vk->v", field.vertices - skinned.vertices[nearest], skinned.normals[nearest])
@@ -71,13 +73,15 @@ def test_field_surface_borrows_weights_of_the_right_bone():
     posed_tip = avatar.skin(tip, avatar.bone_transforms(bent(1.2)[None])[0]).numpy()
     for bone, end in ((1, posed_tip[0]), (0, posed_tip[1])):
         near = np.linalg.norm(mesh.vertices - end, axis=1) < 1.5 * RADIUS
-        assert near.any() and mesh.weights[near, bone].min() > 0.9
+        assert near.any()
+        assert mesh.weights[near, bone].min() > 0.9
 
 
 def test_a_point_without_correspondence_does_not_step_the_surface():
     avatar = ToyAvatar()
     mesh = field_surface(avatar, bent(0.4), None, 64)
-    assert mesh.normals is not None and np.isfinite(mesh.vertices).all()
+    assert mesh.normals is not None
+    assert np.isfinite(mesh.vertices).all()
     assert solid_of(mesh).body_count == 1
 
 

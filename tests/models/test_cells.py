@@ -56,9 +56,11 @@ def test_occupied_cells_are_those_of_the_shape():
     avatar = capsule_avatar()
     occupied = avatar.model.occupied_cells(POSES)
     inner, outer = cells_of(avatar, capsule_points(RADIUS - 0.04)), cells_of(avatar, capsule_points(RADIUS + 0.07))
-    assert bool(occupied[inner].all()) and not bool(occupied[~outer].any())
+    assert bool(occupied[inner].all())
+    assert not bool(occupied[~outer].any())
     wider = avatar.model.occupied_cells(POSES, reach_m=0.1)
-    assert bool(wider[cells_of(avatar, capsule_points(RADIUS + 0.05))].all()) and int(wider.sum()) < wider.numel()
+    assert bool(wider[cells_of(avatar, capsule_points(RADIUS + 0.05))].all())
+    assert int(wider.sum()) < wider.numel()
     assert bool((avatar.model.occupied_cells(POSES, threshold=-3.0) >= occupied).all())
 
 
@@ -84,7 +86,8 @@ def test_what_is_not_searched_counts_as_empty_but_is_reached_into():
     left[:, :, 10:] = False
     deformer.set_active_cells(left)
     occupied = avatar.model.occupied_cells(POSES)
-    assert not bool(occupied[:, :, 11:].any()) and bool(occupied[:, :, 5:10].any())
+    assert not bool(occupied[:, :, 11:].any())
+    assert bool(occupied[:, :, 5:10].any())
     assert bool(avatar.model.occupied_cells(POSES, reach_m=0.1)[:, :, 11].any())
 
 
@@ -107,7 +110,8 @@ def test_cells_at_the_bones_always_stay():
         avatar.model.shape.layers[-1].bias.fill_(-1.8)  # all that is left is a thread of 1 cm
     avatar.model.refresh_cells(POSES)
     cells = avatar.model.deformer.active_cells
-    assert bool(cells[bones].all()) and int(cells.sum()) < cells.numel()
+    assert bool(cells[bones].all())
+    assert int(cells.sum()) < cells.numel()
     assert bool(bones[cells_of(avatar, capsule_points(0.05))].all())
 
 
@@ -121,7 +125,8 @@ def test_final_cells_are_fewer_and_answer_alike():
     avatar.model.tighten_cells(POSES)
     after = avatar.query(points, transforms, pose)
     assert int(avatar.model.deformer.active_cells.sum()) < 0.7 * cells
-    assert torch.equal(before.logits > 0, after.logits > 0) and int((after.logits > 0).sum()) > 50
+    assert torch.equal(before.logits > 0, after.logits > 0)
+    assert int((after.logits > 0).sum()) > 50
     assert after.correspondences < before.correspondences
 
 

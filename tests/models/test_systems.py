@@ -298,7 +298,7 @@ def test_what_a_system_lacks_is_refused(store):
     avatar = new_system(store, "nasa")
     with pytest.raises(ValueError, match="model nasa has no canonical shape"):
         avatar.mesh(POSES[0], resolution=16, surface="skinned")
-    with pytest.raises(ValueError, match="model nasa searches no correspondences, got search.name 'broyden'"):
+    with pytest.raises(ValueError, match=r"model nasa searches no correspondences, got search.name 'broyden'"):
         avatar.model.choose_search(SearchConfig("broyden"))
     with pytest.raises(ValueError, match="model back_d has no skinning weights"):
         new_system(store, "back_d").skinning_weights(torch.zeros(1, 3))

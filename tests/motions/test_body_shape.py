@@ -21,7 +21,8 @@ BETAS = np.linspace(-1, 1, 16)
 def test_spellings(tmp_path, gender, expected):
     np.savez(tmp_path / "shape.npz", gender=gender, betas=BETAS)
     found, betas = read_shape(tmp_path / "shape.npz")
-    assert found == expected and betas.dtype == np.float64
+    assert found == expected
+    assert betas.dtype == np.float64
     np.testing.assert_array_equal(betas, BETAS)
 
 
@@ -29,7 +30,8 @@ def test_sequences_and_rows(tmp_path):
     rows = np.tile(BETAS, (3, 1)).astype(np.float32)
     np.savez(tmp_path / "a.npz", poses=np.zeros((3, 156)), betas=rows, extra=np.array([{}]))
     gender, betas = read_shape(tmp_path / "a.npz")
-    assert gender == "neutral" and betas.shape == (16,)
+    assert gender == "neutral"
+    assert betas.shape == (16,)
     np.testing.assert_allclose(betas, BETAS, atol=1e-7)
 
 
@@ -49,4 +51,5 @@ def test_bad_content(tmp_path, arrays, message):
     np.savez(tmp_path / "shape.npz", **arrays)
     with pytest.raises(UserError, match=message) as caught:
         read_shape(tmp_path / "shape.npz")
-    assert "shape.npz" in str(caught.value) and str(caught.value).isprintable()
+    assert "shape.npz" in str(caught.value)
+    assert str(caught.value).isprintable()

@@ -34,17 +34,22 @@ def degrees(motion, name):
 def test_joints_stay_inside_human_limits(motions, name):
     for seed in SEEDS:
         motion = motions[name, seed]
-        assert np.isfinite(motion.poses).all() and np.isfinite(motion.translation).all()
+        assert np.isfinite(motion.poses).all()
+        assert np.isfinite(motion.translation).all()
         for side, sign in (("l", 1), ("r", -1)):
             knee = degrees(motion, f"{side}_knee")
-            assert knee[:, 0].min() > -1 and knee[:, 0].max() < 146  # a knee is a hinge and never bends backwards
+            assert knee[:, 0].min() > -1
+            assert knee[:, 0].max() < 146
             np.testing.assert_allclose(knee[:, 1:], 0, atol=1e-6)
             elbow = Rotation.from_rotvec(motion.poses[:, JOINT[f"{side}_elbow"]]).as_euler("YXZ", degrees=True)
-            assert (-sign * elbow[:, 0]).min() > -1 and (-sign * elbow[:, 0]).max() < 151
-            assert np.abs(elbow[:, 1]).max() < 0.45 * 85 + 1e-6 and np.abs(elbow[:, 2]).max() < 1e-6
+            assert (-sign * elbow[:, 0]).min() > -1
+            assert (-sign * elbow[:, 0]).max() < 151
+            assert np.abs(elbow[:, 1]).max() < 0.45 * 85 + 1e-6
+            assert np.abs(elbow[:, 2]).max() < 1e-6
             thigh = Rotation.from_rotvec(motion.poses[:, JOINT[f"{side}_hip"]]).apply([0.0, -1.0, 0.0])
             flexion = np.degrees(np.arctan2(thigh[:, 2], -thigh[:, 1]))
-            assert flexion.min() > -50 and np.degrees(np.arccos(-thigh[:, 1])).max() < 135
+            assert flexion.min() > -50
+            assert np.degrees(np.arccos(-thigh[:, 1])).max() < 135
             for joint, most in (("wrist", 85), ("hand", 80), ("ankle", 60), ("foot", 60), ("collar", 45), ("shoulder", 175)):
                 assert np.linalg.norm(degrees(motion, f"{side}_{joint}"), axis=1).max() < most, (side, joint)
         trunk = sum(np.linalg.norm(degrees(motion, f"spine{number}"), axis=1) for number in (1, 2, 3))
@@ -93,7 +98,8 @@ def test_the_floor_is_never_crossed(motions, name):
 def test_root_faces_forwards_and_stands_up(motions):
     for name in TRAINING_SEQUENCES:
         turn = Rotation.from_rotvec(motions[name, SEEDS[0]].poses[:, 0])
-        assert turn.apply([0.0, 0.0, 1.0])[:, 2].min() > 0.8 and turn.apply([0.0, 1.0, 0.0])[:, 1].min() > 0.9
+        assert turn.apply([0.0, 0.0, 1.0])[:, 2].min() > 0.8
+        assert turn.apply([0.0, 1.0, 0.0])[:, 1].min() > 0.9
 
 
 def test_hopping_leaves_the_ground_and_standing_does_not(motions):
@@ -107,7 +113,8 @@ def test_hopping_leaves_the_ground_and_standing_does_not(motions):
 def test_same_seed_same_motion_other_seed_other_motion(motions):
     for name in ALL:
         first, again = motions[name, SEEDS[0]], builtin_motion(name, SEEDS[0])
-        assert np.array_equal(first.poses, again.poses) and np.array_equal(first.translation, again.translation)
+        assert np.array_equal(first.poses, again.poses)
+        assert np.array_equal(first.translation, again.translation)
         assert np.sqrt(np.mean((first.poses - motions[name, SEEDS[1]].poses) ** 2)) > 0.02  # radians
 
 
@@ -168,7 +175,7 @@ def test_angles_mean_what_they_say():
 
 
 def test_wrong_arguments():
-    with pytest.raises(UserError, match="no built-in motion 'jumping_jack'; did you mean 'jumping_jacks'?"):
+    with pytest.raises(UserError, match=r"no built-in motion 'jumping_jack'; did you mean 'jumping_jacks'?"):
         builtin_motion("jumping_jack")
     with pytest.raises(UserError, match=r"no built-in motion 'xyzzy'\. Known are"):
         builtin_motion("xyzzy")

@@ -109,7 +109,8 @@ def test_programs_names(text, expected, spine):
 def test_smpl_names_in_many_spellings(spell):
     parts = find_body_parts([spell(name) for name in SMPL_JOINT_NAMES], PARENTS)
     expected = {name: joint for joint, name in enumerate(SMPL_JOINT_NAMES) if not name.startswith("spine")}
-    assert parts.joints == expected and parts.spine == (3, 6, 9)
+    assert parts.joints == expected
+    assert parts.spine == (3, 6, 9)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +130,8 @@ def test_plain_names(name, plain):
 
 def test_what_is_no_body():
     parts = find_body_parts(["body", "wheel", "door"], [-1, 0, 0])
-    assert parts.joints == {} and parts.spine == ()
+    assert parts.joints == {}
+    assert parts.spine == ()
     assert find_body_parts([], []).joints == {}
 
 

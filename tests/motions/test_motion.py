@@ -19,7 +19,9 @@ def motion():
 
 def test_slice(motion):
     part = motion.slice(5, 20, 3)
-    assert part.num_frames == 5 and part.frame_rate == 10.0 and part.name == "turn"
+    assert part.num_frames == 5
+    assert part.frame_rate == 10.0
+    assert part.name == "turn"
     np.testing.assert_array_equal(part.poses, motion.poses[5:20:3])
     assert motion.slice(-3).num_frames == 3
 
@@ -28,7 +30,8 @@ def test_resampled_keeps_the_pace(motion):
     for rate in (60.0, 24.0, 7.0):
         other = motion.resampled(rate)
         t = np.arange(other.num_frames) / rate
-        assert other.num_frames == int(rate) + 1 and other.frame_rate == rate
+        assert other.num_frames == int(rate) + 1
+        assert other.frame_rate == rate
         np.testing.assert_allclose(other.poses[:, 0], np.outer(2 * t, [0, 1.0, 0]), atol=1e-12)
         np.testing.assert_allclose(other.translation[:, 1], t, atol=1e-12)
 

@@ -20,7 +20,9 @@ from snarfcli.motions.layouts import SMPL, SMPL_H, SMPL_X
 def test_long_poses_keep_the_body_and_straighten_the_hands(tmp_path, width):
     arrays = amass_arrays(width=width)
     motion = read_motion(save(tmp_path, **arrays), up="z")
-    assert motion.name == "walk_poses" and motion.frame_rate == 120.0 and motion.poses.shape == (4, 24, 3)
+    assert motion.name == "walk_poses"
+    assert motion.frame_rate == 120.0
+    assert motion.poses.shape == (4, 24, 3)
     np.testing.assert_array_equal(motion.poses[:, 1:22].reshape(4, -1), arrays["poses"][:, 3:66])
     np.testing.assert_array_equal(motion.poses[:, 22:], 0)
 
@@ -87,7 +89,8 @@ def test_single_pose_and_joint_axis(tmp_path):
 def test_missing_frame_rate_is_noted(tmp_path, caplog):
     with caplog.at_level(logging.INFO, "snarfcli"):
         motion = read_motion(save(tmp_path, poses=np.zeros((2, 72))))
-    assert motion.frame_rate == 60.0 and "no frame rate given, 60 frames a second assumed" in caplog.text
+    assert motion.frame_rate == 60.0
+    assert "no frame rate given, 60 frames a second assumed" in caplog.text
 
 
 def one_absurd_value():
@@ -138,7 +141,8 @@ def test_bad_content(tmp_path, arrays, message):
     path = save(tmp_path, **arrays)
     with pytest.raises(UserError, match=message) as caught:
         read_motion(path)
-    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
 
 
 def smpl_like(names):
@@ -175,7 +179,7 @@ def test_a_skeleton_of_another_kind_takes_its_own_width_only(tmp_path):
     own = smpl_like([f"bone{j}" for j in range(52)])
     path = save(tmp_path, **amass_arrays())
     np.testing.assert_array_equal(read_motion(path, own, up="y").poses.reshape(4, 156), amass_arrays()["poses"])
-    with pytest.raises(UserError, match="has 165 values a frame, wanted 156$"):
+    with pytest.raises(UserError, match=r"has 165 values a frame, wanted 156$"):
         read_motion(save(tmp_path, **amass_arrays(width=165)), own)
 
 
@@ -186,5 +190,9 @@ def test_someone_spinning_is_not_in_degrees(tmp_path):
 
 
 def test_default_skeleton_is_smpl(tmp_path):
-    assert SMPL == SMPL_JOINT_NAMES and len(SMPL_H) == 52 and len(SMPL_X) == 55
-    assert SMPL_H[22] == "l_index1" and SMPL_H[37] == "r_index1" and SMPL_X[22:26] == ("jaw", "l_eye", "r_eye", "l_index1")
+    assert SMPL == SMPL_JOINT_NAMES
+    assert len(SMPL_H) == 52
+    assert len(SMPL_X) == 55
+    assert SMPL_H[22] == "l_index1"
+    assert SMPL_H[37] == "r_index1"
+    assert SMPL_X[22:26] == ("jaw", "l_eye", "r_eye", "l_index1")

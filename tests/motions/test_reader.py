@@ -40,7 +40,7 @@ def test_wrong_arguments(tmp_path):
         read_motion(tmp_path / "a.npz", up="x")
     with pytest.raises(ValueError, match="hands: wanted 'rest' or 'released', got 'fists'"):
         read_motion(tmp_path / "a.npz", hands="fists")
-    with pytest.raises(UserError, match="has 72 values a frame, wanted 6$"):
+    with pytest.raises(UserError, match=r"has 72 values a frame, wanted 6$"):
         read_motion(save(tmp_path, poses=np.zeros((1, 72))), TWO_JOINTS)
 
 
@@ -75,7 +75,8 @@ def test_equal_samples_through_every_route(tmp_path):
     for name in ("old_poses.npz", "new_stageii.npz", "parts.npz", "plain.npz", "joints.npz", "matrices.npz", "frames",
                  "gBR_sBM.pkl"):  # fmt: skip
         motion = read_motion(tmp_path / name)
-        assert motion.name == name.split(".")[0] and motion.frame_rate == 60
+        assert motion.name == name.split(".")[0]
+        assert motion.frame_rate == 60
         np.testing.assert_allclose(motion.poses, body, atol=1e-12, err_msg=name)
         np.testing.assert_allclose(motion.translation, ours.translation, atol=1e-12, err_msg=name)
     np.save(tmp_path / "plain.npy", body.reshape(12, 72).astype(np.float32))
@@ -87,20 +88,20 @@ def test_equal_samples_through_every_route(tmp_path):
 def test_folders_that_are_no_frames(tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
-    with pytest.raises(UserError, match="frames holds no .npz files; give a pose file, or a folder with one for each frame"):
+    with pytest.raises(UserError, match=r"frames holds no .npz files; give a pose file, or a folder with one for each frame"):
         read_motion(folder)
     np.savez(folder / "a_2.npz", pose=np.zeros(72), transl=np.zeros(3))
     np.savez(folder / "a_10.npz", pose=np.zeros(72))
-    with pytest.raises(UserError, match="a_10.npz: trans is missing or has another shape"):
+    with pytest.raises(UserError, match=r"a_10.npz: trans is missing or has another shape"):
         read_motion(folder)
     np.savez(folder / "a_10.npz", v_posed=np.zeros((5, 3)))
-    with pytest.raises(UserError, match="a_10.npz has no 'pose'; every .npz file"):
+    with pytest.raises(UserError, match=r"a_10.npz has no 'pose'; every .npz file"):
         read_motion(folder)
     np.savez(folder / "a_10.npz", pose=np.full(72, np.nan))
-    with pytest.raises(UserError, match="a_10.npz: pose must hold finite numbers"):
+    with pytest.raises(UserError, match=r"a_10.npz: pose must hold finite numbers"):
         read_motion(folder)
     np.savez(folder / "a_10.npz", poses=np.zeros((5, 156)))
-    with pytest.raises(UserError, match="a_10.npz holds more than one pose; name a file"):
+    with pytest.raises(UserError, match=r"a_10.npz holds more than one pose; name a file"):
         read_motion(folder)
 
 

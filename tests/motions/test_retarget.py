@@ -45,7 +45,8 @@ def bones(points):
 def test_the_skeletons_own_rig_gives_its_poses_back(tmp_path, motion):
     path = write_bvh(tmp_path / "own.bvh", rig_of(motion.poses, motion.translation, frame_rate=motion.frame_rate))
     back = read_motion(path)
-    assert back.name == "own" and back.frame_rate == motion.frame_rate
+    assert back.name == "own"
+    assert back.frame_rate == motion.frame_rate
     difference = Rotation.from_rotvec(back.poses.reshape(-1, 3)).inv() * Rotation.from_rotvec(motion.poses.reshape(-1, 3))
     assert difference.magnitude().max() < 1e-7
     np.testing.assert_allclose(back.translation, motion.translation, atol=1e-7)
@@ -215,7 +216,8 @@ def test_mapping_files(tmp_path):
     message = "no joint for pelvis, l_hip, .*give mapping=FILE.json with .*; the file has bone 0, bone 1"
     with pytest.raises(UserError, match=message) as error:
         read_motion(path)
-    assert "\n" not in str(error.value) and len(str(error.value)) < 1000
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 1000
     mapping = dict(zip(SMPL_JOINT_NAMES, names, strict=True))
     (tmp_path / "map.json").write_text(json.dumps(mapping))
     np.testing.assert_allclose(places(read_motion(path, mapping=tmp_path / "map.json")), places(STANDING), atol=FEW)
@@ -239,7 +241,8 @@ def test_mappings_that_are_none(tmp_path, mapping, message):
     (tmp_path / "map.json").write_text(json.dumps(mapping))
     with pytest.raises(UserError, match=message) as error:
         read_motion(path, mapping=tmp_path / "map.json")
-    assert "map.json" in str(error.value) and str(error.value).isprintable()
+    assert "map.json" in str(error.value)
+    assert str(error.value).isprintable()
     with pytest.raises(UserError, match="no mapping at"):
         read_motion(path, mapping=tmp_path / "none.json")
 
@@ -250,8 +253,10 @@ def test_choosing_clips(tmp_path, caplog):
     with caplog.at_level(logging.INFO, "snarfcli"):
         assert choose_clip(rig, None, tmp_path / "a.glb").name == "idle"
     assert "clip 0 of 3 is taken; others by clip=NAME or number (0: 'idle', 1: 'run', 2: '0')" in caplog.text
-    assert choose_clip(rig, "run", tmp_path).name == "run" and choose_clip(rig, 1, tmp_path).name == "run"
-    assert choose_clip(rig, "0", tmp_path).name == "0" and choose_clip(rig, "2", tmp_path).name == "0"
+    assert choose_clip(rig, "run", tmp_path).name == "run"
+    assert choose_clip(rig, 1, tmp_path).name == "run"
+    assert choose_clip(rig, "0", tmp_path).name == "0"
+    assert choose_clip(rig, "2", tmp_path).name == "0"
     with pytest.raises(UserError, match="a.glb has no clip 'rum'; did you mean 'run'\\? It has 'idle', 'run', '0'"):
         choose_clip(rig, "rum", tmp_path / "a.glb")
     with pytest.raises(UserError, match="has no motion in it"):
@@ -279,7 +284,8 @@ def test_rigs_that_cannot_be_used(tmp_path):
 def test_the_built_in_body_takes_it_too(tmp_path):
     path = write_bvh(tmp_path / "walk.bvh", rig_of(STANDING.poses, STANDING.translation, CMU_NAMES, rest_pose=a_pose()))
     motion = read_motion(path, builtin_body().skeleton())
-    assert motion.poses.shape == STANDING.poses.shape and motion.poses.dtype == np.float64
+    assert motion.poses.shape == STANDING.poses.shape
+    assert motion.poses.dtype == np.float64
     assert np.abs(motion.translation - STANDING.translation).max() < 0.1  # the two bodies are of about one size
 
 

@@ -34,7 +34,8 @@ class EmulatedGpu:
     def launch(self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: ctypes.Structure) -> None:
         self.launches.append(kernel)
         assert (cuda_sources() / "cuda" / f"{source}.cu").read_text().count(f" {kernel}(") == 1
-        assert min(blocks) > 0 and self.library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
+        assert min(blocks) > 0
+        assert self.library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
 
 
 def host_compiler() -> str | None:

@@ -107,7 +107,8 @@ def test_constants_are_those_of_the_headers():
     assert f"kSameRoot = {cuda._SAME_ROOT:.0e};".replace("e-0", "e-") in shared
     assert f"kSameBroydenRoot = {cuda._SAME_BROYDEN_ROOT:.0e};".replace("e-0", "e-") in shared
     complete = (cuda_compile.cuda_sources() / "cuda" / "complete.cu").read_text()
-    assert f"kThreads = {cuda._THREADS};" in complete and f"kCurvedThreads = {cuda._CURVED_THREADS};" in complete
+    assert f"kThreads = {cuda._THREADS};" in complete
+    assert f"kCurvedThreads = {cuda._CURVED_THREADS};" in complete
 
 
 def test_functions_take_what_the_operators_take():
@@ -159,7 +160,8 @@ def test_complete_search_finds_every_root_beside_folds(runner, angle):
     points, poses, weights, grid, transforms = scene(24, angle, batch=1, count=150)
     canonical, query, inverse, _ = runner.complete(points, transforms, grid, SHAPE)
     assert check_against_truth(canonical, query, points[0], poses[0], weights, grid) > 0
-    assert bool((torch.linalg.det(inverse) < 0).any()) and bool((query.diff() >= 0).all())
+    assert bool((torch.linalg.det(inverse) < 0).any())
+    assert bool((query.diff() >= 0).all())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
@@ -185,7 +187,7 @@ def test_broyden_search_equals_the_reference(runner, dtype, exact):
 
 
 def test_orientation_preserving_roots_only(runner):
-    points, poses, weights, grid, transforms = scene(24, 1.0, batch=1)
+    points, poses, _weights, grid, transforms = scene(24, 1.0, batch=1)
     everything = runner.complete(points, transforms, grid, SHAPE)
     preserving = runner.complete(points, transforms, grid, SHAPE, orientation_preserving=True)
     keep = torch.linalg.det(everything[2]) > 0
@@ -194,7 +196,8 @@ def test_orientation_preserving_roots_only(runner):
         assert torch.equal(mine, theirs[keep])
     starts = _start_transforms(poses, None)
     preserving = runner.broyden(points, transforms, starts, grid, SHAPE, orientation_preserving=True)
-    assert len(preserving[1]) and bool((torch.linalg.det(preserving[2]) > 0).all())
+    assert len(preserving[1])
+    assert bool((torch.linalg.det(preserving[2]) > 0).all())
 
 
 def test_roots_on_faces_come_once(runner):
@@ -215,7 +218,7 @@ def test_result_does_not_depend_on_the_size_of_a_block(emulated, block, dtype, m
     # Real threads: a missing barrier, a race on shared memory or a wrong share of the work would show. Leaving out
     # any one barrier of complete.cu is reported here by ThreadSanitizer (build_emulation() tells how to use it).
     monkeypatch.setattr(cuda, "_CURVED_BLOCKS", 2)  # that take turns
-    points, poses, weights, grid, transforms = scene(24, 0.8, dtype, batch=2, count=150, shape=(3, 4, 4))
+    points, poses, _weights, grid, transforms = scene(24, 0.8, dtype, batch=2, count=150, shape=(3, 4, 4))
     one = emulated.complete(points, transforms, grid, (3, 4, 4))
     assert len(one[1]) > 300
     many = Runner("emulated", block).complete(points, transforms, grid, (3, 4, 4))
@@ -232,7 +235,8 @@ def test_result_does_not_depend_on_batch_groups_or_guesses(runner, monkeypatch):
     for b in range(3):
         alone = runner.complete(points[b : b + 1], transforms[b : b + 1], grid, SHAPE)
         mine = whole[1] // 200 == b
-        assert torch.equal(whole[0][mine], alone[0]) and torch.equal(whole[2][mine], alone[2])
+        assert torch.equal(whole[0][mine], alone[0])
+        assert torch.equal(whole[2][mine], alone[2])
         assert torch.equal(whole[1][mine] - 200 * b, alone[1])
     one_cell = 4 * cuda._RECORD_NUMBERS
     for group_bytes in (one_cell * 50, one_cell * 210, one_cell * 450):  # parts of a pose's 210 cells, one pose, two poses
@@ -249,44 +253,51 @@ def test_capacity_pads_cuts_and_counts(runner):
         whole = run(points, transforms, *start, grid, SHAPE)
         rows = len(whole[1])
         padded = run(points, transforms, *start, grid, SHAPE, capacity=rows + 7)
-        assert int(padded[3]) == rows and all(len(part) == rows + 7 for part in padded[:3])
+        assert int(padded[3]) == rows
+        assert all(len(part) == rows + 7 for part in padded[:3])
         for mine, theirs, empty in zip(padded[:3], whole[:3], (0, 400, 0), strict=True):
-            assert torch.equal(mine[:rows], theirs) and bool((mine[rows:] == empty).all())
+            assert torch.equal(mine[:rows], theirs)
+            assert bool((mine[rows:] == empty).all())
         exact = run(points, transforms, *start, grid, SHAPE, capacity=rows)
         assert all(torch.equal(a, b) for a, b in zip(exact, whole, strict=True))
         cut = run(points, transforms, *start, grid, SHAPE, capacity=100)
         assert int(cut[3]) == rows
-        assert torch.equal(cut[1], whole[1][:100]) and torch.equal(cut[0], whole[0][:100])
+        assert torch.equal(cut[1], whole[1][:100])
+        assert torch.equal(cut[0], whole[0][:100])
         nothing = run(points, transforms, *start, grid, SHAPE, capacity=0)
-        assert int(nothing[3]) == rows and nothing[0].shape == (0, 3)
+        assert int(nothing[3]) == rows
+        assert nothing[0].shape == (0, 3)
 
 
 def test_slots_that_run_out_are_counted_and_not_overrun(emulated, monkeypatch):
     points, _, _, grid, transforms = scene(24, 0.7, batch=1)
     rows = len(emulated.complete(points, transforms, grid, SHAPE)[1])
     monkeypatch.setattr(cuda, "_slots_for", lambda capacity: 20)
-    canonical, query, _, found = emulated.complete(points, transforms, grid, SHAPE, capacity=rows)
+    _canonical, query, _, found = emulated.complete(points, transforms, grid, SHAPE, capacity=rows)
     assert int(found) >= rows  # more than were kept: the caller can tell
-    assert int((query < 200).sum()) <= 20 and bool((query[20:] == 200).all())
+    assert int((query < 200).sum()) <= 20
+    assert bool((query[20:] == 200).all())
 
 
 @pytest.mark.parametrize(("batch", "count"), [(0, 5), (2, 0), (0, 0), (1, 1)])
 def test_few_queries_and_poses(runner, batch, count):
-    _, poses, weights, grid, transforms = scene(3, 0.4, batch=2, count=1)
+    _, poses, _weights, grid, transforms = scene(3, 0.4, batch=2, count=1)
     points, transforms = torch.zeros(batch, count, 3).double(), transforms[:batch]
     starts = _start_transforms(poses, None)[:batch]
     for found in (
         runner.complete(points, transforms, grid, SHAPE),
         runner.broyden(points, transforms, starts, grid, SHAPE),
     ):
-        assert found[0].shape == (batch * count, 3) and found[2].shape == (batch * count, 3, 3)
+        assert found[0].shape == (batch * count, 3)
+        assert found[2].shape == (batch * count, 3, 3)
         assert int(found[3]) == len(found[1]) == batch * count
     padded = runner.complete(points, transforms, grid, SHAPE, capacity=4)
-    assert int(padded[3]) == batch * count and padded[1].tolist()[batch * count :] == [batch * count] * (4 - batch * count)
+    assert int(padded[3]) == batch * count
+    assert padded[1].tolist()[batch * count :] == [batch * count] * (4 - batch * count)
 
 
 def test_active_cells(runner):
-    points, poses, weights, grid, transforms = scene(24, 0.6, batch=2)
+    points, _poses, _weights, grid, transforms = scene(24, 0.6, batch=2)
     none = torch.zeros(5, 6, 7, dtype=torch.bool)
     assert len(runner.complete(points, transforms, grid, SHAPE, none)[1]) == 0
     some = torch.rand(5, 6, 7, generator=torch.Generator().manual_seed(0)) < 0.5
@@ -309,7 +320,7 @@ def test_small_and_flat_grids(runner, shape):
 
 
 def test_queries_that_are_not_finite_or_far_away(runner):
-    points, poses, weights, grid, transforms = scene(6, 0.3, torch.float32, batch=2)
+    points, poses, _weights, grid, transforms = scene(6, 0.3, torch.float32, batch=2)
     whole = runner.complete(points, transforms, grid, SHAPE)
     strange = [torch.nan, torch.inf, -torch.inf, 1e38, -1e38, 1e6, 50.0]
     more = torch.tensor([[value, 0.1, 0.2] for value in strange] + [[0.0, 0.0, value] for value in strange])
@@ -319,7 +330,8 @@ def test_queries_that_are_not_finite_or_far_away(runner):
         (runner.complete(mixed, transforms, grid, SHAPE), whole),
         (runner.broyden(mixed, transforms, starts, grid, SHAPE), runner.broyden(points, transforms, starts, grid, SHAPE)),
     ):
-        assert torch.equal(found[0], wanted[0]) and torch.equal(found[1] % 214 - 14, wanted[1] % 200)
+        assert torch.equal(found[0], wanted[0])
+        assert torch.equal(found[1] % 214 - 14, wanted[1] % 200)
     only = runner.complete(more[None, :5], transforms[:1], grid, SHAPE)
     assert len(only[1]) == 0
 
@@ -345,7 +357,8 @@ def test_broken_transforms_give_no_root_and_spoil_no_other(runner, value):
     broken[0] = value
     found = runner.complete(points, broken, grid, SHAPE)
     second = whole[1] >= 200
-    assert torch.equal(found[1], whole[1][second]) and torch.equal(found[0], whole[0][second])
+    assert torch.equal(found[1], whole[1][second])
+    assert torch.equal(found[0], whole[0][second])
     broken = transforms.clone()
     broken[0, 0] = value  # one node, of one cell
     found = runner.complete(points, broken, grid, SHAPE)
@@ -377,7 +390,7 @@ def test_too_many_queries_are_refused():
     points = torch.empty(1, 1, 3).expand(2**16, 2**15, 3)
     with pytest.raises(ValueError, match="points must be fewer than 2"):
         cuda._check_limits(points.shape[0] * points.shape[1], 1)
-    with pytest.raises(ValueError, match="fewer than 2.31 grid cells"):
+    with pytest.raises(ValueError, match=r"fewer than 2.31 grid cells"):
         cuda._check_limits(1, 2**31)
 
 
@@ -408,8 +421,10 @@ def test_gradient_of_no_roots_is_zero(runner):
     empty = torch.zeros(0, 3).double()
     roots = (empty, empty, torch.zeros(0, dtype=torch.long), torch.zeros(0, 3, 3).double())
     v_points, v_transforms = runner(cuda.run_backward, *roots, grid.lower, grid.upper, SHAPE, 2, 5, True, True)
-    assert v_points.shape == (2, 5, 3) and v_transforms.shape == (2, 336, 12)
-    assert not v_points.any() and not v_transforms.any()
+    assert v_points.shape == (2, 5, 3)
+    assert v_transforms.shape == (2, 336, 12)
+    assert not v_points.any()
+    assert not v_transforms.any()
 
 
 # ---------------------------------------------------------------- on a GPU
@@ -426,7 +441,8 @@ def test_a_search_with_a_capacity_fits_into_a_cuda_graph():
         v_points, _ = cuda.implicit_backward(found[0], *found[:3], grid.lower, grid.upper, SHAPE, 2, 200, True, True)
     static.copy_(points)
     graph.replay()
-    assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True)) and bool(v_points.any())
+    assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+    assert bool(v_points.any())
 
 
 @needs_gpu
@@ -439,7 +455,8 @@ def test_the_current_stream_and_device_are_used():
             moved = torch.zeros_like(points, device=device).copy_(points.to(device))
             box = grid.to(moved)
             found = cuda.complete_search(moved, transforms.to(device), box.lower, box.upper, SHAPE, None, 5e-6, 10, False, None)
-        assert found[0].device == device and len(found[1]) >= 400
+        assert found[0].device == device
+        assert len(found[1]) >= 400
 
 
 @needs_gpu

@@ -33,7 +33,8 @@ def test_nvrtc_compiles_every_kernel(architecture, dtype):
         assert code[:4] == b"\x7fELF"
         text = (cuda_compile.cuda_sources() / "cuda" / f"{source}.cu").read_text()
         kernels = re.findall(r'extern "C" __global__ void .*\b(\w+)\(const', text)
-        assert kernels and all(f".text.{kernel}".encode() in code for kernel in kernels)
+        assert kernels
+        assert all(f".text.{kernel}".encode() in code for kernel in kernels)
 
 
 def test_every_source_is_compiled_and_opens_with_its_design():
@@ -48,7 +49,7 @@ def test_architecture_is_the_device_s_own_or_the_newest_before_it():
     future = cuda_compile.architecture_for((99, 0))
     assert re.fullmatch(r"compute_\d+", future)
     assert cuda_compile.compile_kernels("gather", torch.float32, future).startswith(b"//")  # PTX, for the driver to finish
-    with pytest.raises(RuntimeError, match="does not know compute capability 1.0"):
+    with pytest.raises(RuntimeError, match=r"does not know compute capability 1.0"):
         cuda_compile.architecture_for((1, 0))
 
 
@@ -61,7 +62,8 @@ def test_compiled_kernels_are_kept_and_damaged_ones_compiled_again(tmp_path, mon
     compiled = []
     original = cuda_compile.compile_kernels
     monkeypatch.setattr(cuda_compile, "compile_kernels", lambda *args: compiled.append(args) or original(*args))
-    assert cuda_compile.load_kernels(*wanted) == code and not compiled
+    assert cuda_compile.load_kernels(*wanted) == code
+    assert not compiled
     for damage in (b"", file.read_bytes()[:-1], file.read_bytes()[:100] + b"?" + file.read_bytes()[101:]):
         file.write_bytes(damage)
         assert len(cuda_compile.load_kernels(*wanted)) == len(code)
@@ -99,7 +101,7 @@ def test_a_missing_nvrtc_is_named_with_what_to_do(monkeypatch):
     monkeypatch.setattr(cuda_compile, "_candidates", lambda: ["libno_such_nvrtc.so"])
     cuda_compile._nvrtc.cache_clear()
     try:
-        with pytest.raises(RuntimeError, match="NVRTC was not found.*pip install nvidia-cuda-nvrtc"):
+        with pytest.raises(RuntimeError, match=r"NVRTC was not found.*pip install nvidia-cuda-nvrtc"):
             cuda_compile.nvrtc_version()
     finally:
         cuda_compile._nvrtc.cache_clear()

@@ -66,7 +66,8 @@ def test_without_a_library_auto_warns_once_and_native_raises(no_library):
     with pytest.warns(RuntimeWarning, match=f"reference in PyTorch.*there is no .* in {no_library}") as caught:
         assert library.choose_backend("auto") == "reference"
         assert library.choose_backend("auto") == "reference"
-    assert len(caught) == 1 and caught[0].filename == __file__
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
     with pytest.raises(RuntimeError, match="backend native is not available: there is no"):
         library.choose_backend("native")
     assert library.native_library() is library.library_path() is library.instruction_set() is None
@@ -81,7 +82,8 @@ def test_the_reason_noted_by_the_build_is_told(no_library):
 
 def test_a_broken_note_is_passed_over(no_library):
     (no_library / "native_build.json").write_text("[1, ")
-    assert library.build_note() == {} and "there is no" in library.why_unavailable()
+    assert library.build_note() == {}
+    assert "there is no" in library.why_unavailable()
 
 
 def test_the_variable_names_another_library(fresh, tmp_path):
@@ -89,7 +91,8 @@ def test_the_variable_names_another_library(fresh, tmp_path):
     shutil.copy(library.library_path(), copy)
     library._load.cache_clear()
     fresh.setenv("SNARF_NATIVE_LIBRARY", str(copy))
-    assert library.library_path() == copy and library.why_unavailable() is None
+    assert library.library_path() == copy
+    assert library.why_unavailable() is None
 
 
 def test_a_wrong_variable_is_named(fresh):

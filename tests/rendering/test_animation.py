@@ -70,7 +70,7 @@ def test_a_drawer_that_is_lost_or_fails_is_reported(tmp_path):
     with pytest.raises(RuntimeError, match="KeyError: 'avatar'"):
         drawer.take()
     drawer.begin(0, {"avatar": None})
-    picture, seconds = drawer.take()
+    picture, _seconds = drawer.take()
     np.testing.assert_array_equal(picture, screen.draw(0, {"avatar": None}))
     drawer._process.kill()
     with pytest.raises(UserError, match=r"a process that draws ended early \(exit code -9\)"):
@@ -79,11 +79,13 @@ def test_a_drawer_that_is_lost_or_fails_is_reported(tmp_path):
 
 
 def test_what_processes_may_be():
-    assert parse_processes("auto") is None and parse_processes("3") == 3
+    assert parse_processes("auto") is None
+    assert parse_processes("3") == 3
     for text in ("0", "-1", "many", "65", "1.5"):
         with pytest.raises(UserError, match="processes must be auto or a number from 1 to 64"):
             parse_processes(text)
-    assert choose_processes(4, 100, 128) == 4 and choose_processes(4, 3, 128) == 3
+    assert choose_processes(4, 100, 128) == 4
+    assert choose_processes(4, 3, 128) == 3
     assert choose_processes(None, 2, 128) == 1  # not worth a second process
     assert choose_processes(None, 1000, 100_000) == 1  # no memory for it
     assert choose_processes(4, 100, 128, extract=False) == 4

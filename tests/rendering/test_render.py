@@ -31,7 +31,8 @@ def test_a_ball_is_drawn_where_it_is_projected():
     mesh = ball(colors=RED)
     camera = Camera.framing(mesh.vertices)
     picture = render(mesh, camera, (160, 120))
-    assert picture.shape == (120, 160, 3) and picture.dtype == np.uint8
+    assert picture.shape == (120, 160, 3)
+    assert picture.dtype == np.uint8
     rows, columns = np.nonzero(redness(picture))
     pixels = camera.project(mesh.vertices, 160, 120)
     np.testing.assert_allclose([columns.min(), columns.max() + 1], [pixels[:, 0].min(), pixels[:, 0].max()], atol=1.5)
@@ -76,7 +77,8 @@ def test_framing_keeps_every_point_inside_and_fills_the_picture():
         points = rng.standard_normal((50, 3)) * (2.0, 1.0, 0.5) + (3, 1, -2)
         camera = Camera.framing(points, aspect=aspect, margin=0.05, azimuth_rad=rng.uniform(0, 6))
         pixels = camera.project(points, *size)[:, :2] / size
-        assert pixels.min() > 0.045 and pixels.max() < 0.955
+        assert pixels.min() > 0.045
+        assert pixels.max() < 0.955
         assert max(np.ptp(pixels, axis=0)) > 0.85
 
 
@@ -120,7 +122,8 @@ def test_lines_on_the_floor_are_faint_and_stay_where_they_are():
         for spacing in (None, 0.25)
     )
     darker = (plain - lined).mean(axis=2)
-    assert darker.min() >= 0 and 1 < darker.max() < 25
+    assert darker.min() >= 0
+    assert 1 < darker.max() < 25
     assert 0.01 < (darker > 1).mean() < 0.2
     # a line lies under the world's own multiples of the spacing, whatever the camera looks at
     for x in (0.25, -0.5):

@@ -14,7 +14,9 @@ def tile(value: int) -> np.ndarray:
 def test_pictures_stand_in_their_places(tmp_path):
     sheet = contact_sheet([[tile(10), tile(20)], [tile(30), None]])
     assert sheet.shape == (8 + 2 * 68, 8 + 2 * 88, 3)
-    assert (sheet[8:68, 8:88] == 10).all() and (sheet[8:68, 96:176] == 20).all() and (sheet[76:136, 8:88] == 30).all()
+    assert (sheet[8:68, 8:88] == 10).all()
+    assert (sheet[8:68, 96:176] == 20).all()
+    assert (sheet[76:136, 8:88] == 30).all()
     assert len(np.unique(sheet[76:136, 96:176])) <= 3
     write_png(tmp_path / "folder" / "sheet.png", sheet)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "folder" / "sheet.png")), sheet)
@@ -29,7 +31,8 @@ def test_labels_make_room_for_themselves():
         column_labels=["prediction", "ground truth"],
         captions=[["a", None], ["c", "d"]],
     )
-    assert labelled.shape[1] == plain.shape[1] and labelled.shape[0] > plain.shape[0] + 60
+    assert labelled.shape[1] == plain.shape[1]
+    assert labelled.shape[0] > plain.shape[0] + 60
     assert (labelled == 10).all(axis=2).sum() == 4 * 60 * 80
     assert labelled[:20].min() < 100  # ink of the title
 

@@ -30,13 +30,15 @@ def places(stage, view, frame, points, size=(100, 100)) -> np.ndarray:
 def test_a_still_camera_sees_the_whole_motion_from_every_side_at_one_scale():
     points, poses = walk()
     stage = set_stage(points, poses, parse_views(["front", "left", "back", "top", "-45"], 20, 9))
-    assert stage.is_still and stage.ground.spacing is None
+    assert stage.is_still
+    assert stage.ground.spacing is None
     assert stage.ground.height == pytest.approx(points[..., 1].min())
     distances = []
     for view in range(5):
         assert stage.camera(view, 0) == stage.camera(view, FRAMES - 1)
         seen = places(stage, view, 0, points.reshape(-1, 3))
-        assert seen.min() > 0.05 and seen.max() < 0.95
+        assert seen.min() > 0.05
+        assert seen.max() < 0.95
         camera = stage.camera(view, 0)
         distances.append(np.linalg.norm(np.subtract(camera.position, camera.target)))
     np.testing.assert_allclose(distances, distances[0])
@@ -53,7 +55,8 @@ def test_a_camera_that_follows_keeps_the_body_in_the_middle_and_does_not_sway():
     assert stage.ground.spacing == pytest.approx(0.5)  # lines show that it walks
     for frame in (0, 30, FRAMES - 1):
         seen = places(stage, 0, frame, points[frame])
-        assert seen.min() > 0.05 and seen.max() < 0.95
+        assert seen.min() > 0.05
+        assert seen.max() < 0.95
         assert abs(seen[:, 0].mean() - 0.5) < 0.06
     where = np.array([stage.camera(0, frame).position for frame in range(FRAMES)])
     np.testing.assert_allclose(np.diff(where[:, 2]), 0.05, atol=0.01)  # at the pace of the walk, to its ends
@@ -70,8 +73,10 @@ def test_a_turntable_goes_round_with_everything_in_the_picture():
     np.testing.assert_allclose([offsets[1][0], offsets[1][2]], [offsets[0][2], -offsets[0][0]], atol=1e-9)
     for frame in range(0, FRAMES, 7):
         seen = places(stage, 0, frame, points[frame])
-        assert seen.min() > 0.04 and seen.max() < 0.96
-    assert not stage.is_still and stage.ground.spacing
+        assert seen.min() > 0.04
+        assert seen.max() < 0.96
+    assert not stage.is_still
+    assert stage.ground.spacing
 
 
 def test_what_stands_beside_fits_too_at_the_same_scale():
@@ -81,7 +86,8 @@ def test_what_stands_beside_fits_too_at_the_same_scale():
     for view in range(2):
         camera = stage.camera_on(view, 3, np.zeros(3))
         seen = camera.project(wide, 150, 100)[:, :2] / (150, 100)
-        assert seen.min() > 0.05 and seen.max() < 0.95
+        assert seen.min() > 0.05
+        assert seen.max() < 0.95
         offsets = [np.subtract(one.position, one.target) for one in (camera, stage.camera(view, 3))]
         np.testing.assert_allclose(*offsets)
 
@@ -109,7 +115,8 @@ def test_views_and_turntables_that_nobody_can_show_are_refused():
     ):
         with pytest.raises(UserError, match=message):
             parse_views(names)
-    assert parse_turntable("False") == 0 and parse_turntable("true") == pytest.approx(math.pi / 4)
+    assert parse_turntable("False") == 0
+    assert parse_turntable("true") == pytest.approx(math.pi / 4)
     assert parse_turntable("-90") == pytest.approx(-math.pi / 2)
     for text in ("fast", "nan", "1000", ""):
         with pytest.raises(UserError, match="turntable must be true, false or degrees a second"):
@@ -122,10 +129,11 @@ def test_panels_stand_side_by_side_with_labels_and_say_how_large_they_are():
     screen = Screen(stage, (40, 50), {"avatar": "avatar", "canonical": "canonical shape"}, settled=["canonical"])
     picture = screen.draw(0, {"avatar": None, "canonical": None})
     assert picture.shape == (*picture_size((40, 50), 2, 3)[::-1], 3)
-    assert picture.shape[1] == 3 * 40 + 2 and picture.shape[0] > 2 * 50
+    assert picture.shape[1] == 3 * 40 + 2
+    assert picture.shape[0] > 2 * 50
     assert picture[50:].min() < 120  # ink
     assert Screen(stage, (40, 50), {"a": "a", "b": "b"}).columns == 3
     single = Screen(set_stage(points, poses, parse_views(["front"])), (40, 50), {"avatar": "avatar"})
     assert single.draw(0, {"avatar": None}).shape == (50, 40, 3)
-    with pytest.raises(UserError, match="12 panels of 1024 x 2048 pixels .* give a smaller video_size, which is that of one"):
+    with pytest.raises(UserError, match=r"12 panels of 1024 x 2048 pixels .* give a smaller video_size, which is that of one"):
         picture_size((1024, 2048), 3, 4)

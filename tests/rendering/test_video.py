@@ -25,7 +25,9 @@ def test_frames_size_and_rate_read_back(tmp_path):
     path = tmp_path / "folder" / "video.mp4"
     assert write_video(path, pictures(9, 48, 64), 12.5) == 9
     facts, frames = read_back(path)
-    assert facts["size"] == (64, 48) and facts["codec"] == "h264" and "yuv420p" in facts["pix_fmt"]
+    assert facts["size"] == (64, 48)
+    assert facts["codec"] == "h264"
+    assert "yuv420p" in facts["pix_fmt"]
     assert facts["fps"] == pytest.approx(12.5)
     assert len(frames) == 9
     for picture, frame in zip(pictures(9, 48, 64), frames, strict=True):

@@ -59,11 +59,15 @@ def job(tmp_path):
 def test_everything_is_done_once(job):
     player = Player(job)
     status = run_job(job, runner=player)
-    assert player.calls == ["train", "id", "ood"] and status.state == "done" and status.trained
-    assert set(status.seconds) == {"train", "id", "ood"} and read_status(Path(job.folder)) == status
+    assert player.calls == ["train", "id", "ood"]
+    assert status.state == "done"
+    assert status.trained
+    assert set(status.seconds) == {"train", "id", "ood"}
+    assert read_status(Path(job.folder)) == status
     assert collect(job).values["surface_ood"] == 80.0
     again = Player(job)
-    assert run_job(job, runner=again).state == "done" and again.calls == []
+    assert run_job(job, runner=again).state == "done"
+    assert again.calls == []
 
 
 def test_missing_samples_are_made_first(job, tmp_path):
@@ -76,8 +80,10 @@ def test_missing_samples_are_made_first(job, tmp_path):
 def test_an_interrupted_run_goes_on_at_the_stage_where_it_stopped(job):
     for stage, left in (("train", ["train", "id", "ood"]), ("ood", ["ood"])):
         status = run_job(job, runner=Player(job, **{stage: 130}))
-        assert status.state == "stopped" and status.stage == stage
-        assert collect(job).state == "stopped" and f"interrupted at {stage}" in collect(job).reason
+        assert status.state == "stopped"
+        assert status.stage == stage
+        assert collect(job).state == "stopped"
+        assert f"interrupted at {stage}" in collect(job).reason
         player = Player(job, ood=130 if stage == "train" else 0)
         run_job(job, runner=player)
         assert player.calls == left
@@ -87,24 +93,30 @@ def test_an_interrupted_run_goes_on_at_the_stage_where_it_stopped(job):
 def test_a_stopped_plan_begins_nothing(job):
     player = Player(job)
     assert run_job(job, runner=player, stopped=lambda: True).state == "stopped"
-    assert player.calls == [] and not (Path(job.folder) / STATUS).exists()
+    assert player.calls == []
+    assert not (Path(job.folder) / STATUS).exists()
 
 
 def test_a_failure_is_kept_with_its_reason_and_tried_again(job):
     status = run_job(job, runner=Player(job, train=2))
     assert (status.state, status.stage, status.reason, status.trained) == ("failed", "train", "the reason: what to do", False)
     result = collect(job)
-    assert result.state == "failed" and result.values == {} and "the reason" in result.reason
+    assert result.state == "failed"
+    assert result.values == {}
+    assert "the reason" in result.reason
     player = Player(job)
-    assert run_job(job, runner=player).state == "done" and player.calls == ["train", "id", "ood"]
+    assert run_job(job, runner=player).state == "done"
+    assert player.calls == ["train", "id", "ood"]
 
 
 def test_a_failed_evaluation_leaves_the_numbers_of_the_other(job):
     assert run_job(job, runner=Player(job, ood=1)).state == "failed"
     result = collect(job)
-    assert result.values["surface_id"] == 80.0 and "surface_ood" not in result.values
+    assert result.values["surface_id"] == 80.0
+    assert "surface_ood" not in result.values
     player = Player(job)
-    assert run_job(job, runner=player).state == "done" and player.calls == ["ood"]
+    assert run_job(job, runner=player).state == "done"
+    assert player.calls == ["ood"]
 
 
 def test_a_diverged_run_stays_so(job):
@@ -127,28 +139,33 @@ def test_a_new_avatar_is_evaluated_anew(job):
     assert "surface_id" not in collect(job).values, "numbers of an older avatar"
     player = Player(job, id=2)
     run_job(job, runner=player)
-    assert player.calls == ["id"] and not Path(job.evaluations[0].metrics).exists()
+    assert player.calls == ["id"]
+    assert not Path(job.evaluations[0].metrics).exists()
 
 
 def test_other_settings_are_left_to_train_to_judge(job, tmp_path):
     run_job(job, runner=Player(job))
     other = fake_plan(tmp_path, systems=("snarf",)).jobs[0]
     other = type(other)(**{**vars(other), "digest": "another"})
-    assert collect(other).state == "missing" and "other settings" in collect(other).reason
+    assert collect(other).state == "missing"
+    assert "other settings" in collect(other).reason
     player = Player(other, train=2)
-    assert run_job(other, runner=player).state == "failed" and player.calls == ["train"]
+    assert run_job(other, runner=player).state == "failed"
+    assert player.calls == ["train"]
 
 
 def test_data_without_the_split_is_no_failure(job, tmp_path):
     fake_samples(tmp_path / "data", "50002", ood=0)
     player = Player(job)
-    assert run_job(job, runner=player).state == "done" and player.calls == ["train", "id"]
+    assert run_job(job, runner=player).state == "done"
+    assert player.calls == ["train", "id"]
 
 
 def test_a_command_says_what_it_said_and_why_it_failed(job, tmp_path):
     log = tmp_path / LOG
     assert run_command(["train", "training=quik"], log, lambda: False) == 2
-    assert log.read_text().startswith("$ snarf train training=quik\n") and "did you mean 'quick'" in log.read_text()
+    assert log.read_text().startswith("$ snarf train training=quik\n")
+    assert "did you mean 'quick'" in log.read_text()
     wrong = type(job)(**{**vars(job), "train": ("train", "training=quik")})
     assert "there is no training=quik" in run_job(wrong).reason
 

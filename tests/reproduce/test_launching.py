@@ -32,14 +32,15 @@ def test_a_launcher_brings_every_job_to_its_end(name, tmp_path, monkeypatch):
     statuses = launch(jobs, tmp_path / "work", Launcher(name, processes), lambda *change: seen.append(change))
     said = [path.read_text() for path in tmp_path.glob("work/*/launcher.log")]
     assert [status and status.state for status in statuses] == ["done", "done"], (statuses, said)
-    assert {number for number, status in seen if status.state == "done"} == {0, 1} and len(seen) <= 4
+    assert {number for number, status in seen if status.state == "done"} == {0, 1}
+    assert len(seen) <= 4
     assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs", "work"}, "nothing is left behind elsewhere"
 
 
 def test_a_launcher_that_does_not_start_is_an_error(tmp_path, monkeypatch):
     jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
     monkeypatch.setattr(launching, "_arguments", lambda *_: ["reproduce_job", "plan=none.json", "job=0"])
-    with pytest.raises(UserError, match="launcher=basic started no job: .*no plan at .*none.json; see"):
+    with pytest.raises(UserError, match=r"launcher=basic started no job: .*no plan at .*none.json; see"):
         launch(jobs, tmp_path / "work", Launcher(), lambda *_: None)
 
 
@@ -91,9 +92,11 @@ def test_settings_reach_hydra(tmp_path):
     arguments = launching._arguments(tmp_path, 3, Launcher("submitit_slurm", 8, 4, ("partition=gpu", "timeout_min=60")))
     assert {"job=0,1,2", "-m", "hydra/launcher=submitit_slurm", "hydra.launcher.partition=gpu"} <= set(arguments)
     assert {"hydra.launcher.array_parallelism=8", "hydra.launcher.cpus_per_task=4"} <= set(arguments)
-    assert "hydra.launcher.timeout_min=60" in arguments and len([a for a in arguments if "timeout_min" in a]) == 1
+    assert "hydra.launcher.timeout_min=60" in arguments
+    assert len([a for a in arguments if "timeout_min" in a]) == 1
     assert "hydra.launcher.n_jobs=2" in launching._arguments(tmp_path, 3, Launcher("joblib", 2))
-    assert launching._slots(Launcher("submitit_local", 3)) == 3 and launching._slots(Launcher("joblib", 3)) is None
+    assert launching._slots(Launcher("submitit_local", 3)) == 3
+    assert launching._slots(Launcher("joblib", 3)) is None
 
 
 def test_a_job_that_is_not_in_the_plan_is_refused(tmp_path):

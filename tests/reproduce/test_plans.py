@@ -50,7 +50,8 @@ def test_a_key_stands_for_one_set_of_overrides():
                 what = (row.settings("quick"), row.inside_test)
                 assert rows.setdefault((data, row.key), what) == what, row.key
         keys = [row.key for row in experiment.rows]
-        assert len(set(keys)) == len(keys) and set(experiment.order) <= set(keys)
+        assert len(set(keys)) == len(keys)
+        assert set(experiment.order) <= set(keys)
         for row in experiment.rows if experiment.name in ("table1", "table2") else ():
             assert row.paper is None or paper_numbers(experiment.name, row.paper), row.key
 
@@ -58,12 +59,15 @@ def test_a_key_stands_for_one_set_of_overrides():
 def test_other_settings_have_other_folders_and_machines_do_not_matter(tmp_path):
     plain = fake_plan(tmp_path, systems=("snarf",)).jobs[0]
     extra = fake_plan(tmp_path, systems=("snarf",), extra=("training.steps=7",)).jobs[0]
-    assert plain.folder.endswith("snarf-quick-s0") and extra.folder.startswith(f"{plain.folder}-")
+    assert plain.folder.endswith("snarf-quick-s0")
+    assert extra.folder.startswith(f"{plain.folder}-")
     assert extra.digest != plain.digest
     assert "training.steps=7" in extra.train
     elsewhere = fake_plan(tmp_path, systems=("snarf",), device="cuda", threads=3).jobs[0]
-    assert elsewhere.digest == plain.digest and {"device=cuda", "threads=3"} <= set(elsewhere.train)
-    assert "resume=true" in plain.train and not [one for one in plain.train if one.startswith("threads")]
+    assert elsewhere.digest == plain.digest
+    assert {"device=cuda", "threads=3"} <= set(elsewhere.train)
+    assert "resume=true" in plain.train
+    assert not [one for one in plain.train if one.startswith("threads")]
 
 
 def test_a_whole_table_comes_before_the_second_seed(tmp_path):
@@ -78,7 +82,8 @@ def test_parity_trains_on_samples_of_its_own_and_is_evaluated_on_the_others(tmp_
     assert [samples.folder for samples in job.samples] == [
         str(tmp_path / "data/processed/builtin/50002"), str(tmp_path / "data/parity/processed/builtin/50002"),
     ]  # fmt: skip
-    assert "inside_test=parity" in job.samples[1].arguments and "inside_test=parity" not in job.samples[0].arguments
+    assert "inside_test=parity" in job.samples[1].arguments
+    assert "inside_test=parity" not in job.samples[0].arguments
     assert f"data_root='{tmp_path}/data/parity'" in job.train
     assert all(evaluation.data_root == str(tmp_path / "data") for evaluation in job.evaluations)
 
@@ -88,7 +93,8 @@ def test_dfaust_is_evaluated_on_poseprior(tmp_path):
         fake_samples(tmp_path / "data", "50002", data)
     job = fake_plan(tmp_path, data="dfaust", systems=("snarf",)).jobs[0]
     assert {evaluation.split: evaluation.data for evaluation in job.evaluations} == {"id": "dfaust", "ood": "poseprior"}
-    assert job.evaluations[1].metrics.endswith("eval_ood_poseprior/metrics.json") and len(job.samples) == 2
+    assert job.evaluations[1].metrics.endswith("eval_ood_poseprior/metrics.json")
+    assert len(job.samples) == 2
 
 
 def test_jobs_survive_being_written_down(tmp_path):
@@ -112,12 +118,12 @@ def test_all_runs_what_experiments_share_once(tmp_path):
 
 
 WRONG = [
-    (dict(systems=("nsa",)), "there is no row 'nsa'; did you mean 'nasa'?"),
-    (dict(training="quik"), "there is no training=quik; did you mean 'quick'?"),
-    (dict(data="cape"), "table1 is made on data=builtin or dfaust, got 'cape'"),
-    (dict(seeds=(1, 1)), "seeds must be different"),
-    (dict(seeds=()), "seeds must be different whole numbers from 0, at least one"),
-    (dict(extra=("seed=3",)), "extra: seed is set by reproduce itself; give seeds="),
+    ({"systems": ("nsa",)}, "there is no row 'nsa'; did you mean 'nasa'?"),
+    ({"training": "quik"}, "there is no training=quik; did you mean 'quick'?"),
+    ({"data": "cape"}, "table1 is made on data=builtin or dfaust, got 'cape'"),
+    ({"seeds": (1, 1)}, "seeds must be different"),
+    ({"seeds": ()}, "seeds must be different whole numbers from 0, at least one"),
+    ({"extra": ("seed=3",)}, "extra: seed is set by reproduce itself; give seeds="),
 ]
 
 
@@ -131,12 +137,12 @@ def test_a_choice_that_cannot_be_made_is_refused(choice, message, tmp_path):
 def test_subjects_must_be_there_before_anything_runs(tmp_path):
     with pytest.raises(UserError, match="no subject '50003'; did you mean"):
         make_plan(EXPERIMENTS["table1"], Choice(subjects=("50003",), data_root=str(tmp_path)), resolve_training)
-    with pytest.raises(UserError, match="(?i)dfaust"):
+    with pytest.raises(UserError, match=r"(?i)dfaust"):
         make_plan(EXPERIMENTS["table1"], Choice(data="dfaust", data_root=str(tmp_path)), resolve_training)
 
 
 def test_experiments_are_known_by_name():
-    with pytest.raises(UserError, match="one of table1, .*, all, got 'tabel1'; did you mean 'table1'"):
+    with pytest.raises(UserError, match=r"one of table1, .*, all, got 'tabel1'; did you mean 'table1'"):
         choose_experiments("tabel1", Choice())
-    with pytest.raises(UserError, match="row pose_onet: unknown setting 'training.stps'"):
+    with pytest.raises(UserError, match=r"row pose_onet: unknown setting 'training.stps'"):
         make_plan(EXPERIMENTS["table1"], Choice(extra=("training.stps=3",)), resolve_training)

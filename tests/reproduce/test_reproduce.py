@@ -50,8 +50,10 @@ WRONG = {
 @pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
 def test_a_user_error_is_one_line_with_code_2(capsys, elsewhere, arguments):
     code, out, err = call(capsys, *arguments)
-    assert code == 2 and WRONG[arguments] in err
-    assert len(err.strip().splitlines()) == 1 and "Traceback" not in out + err
+    assert code == 2
+    assert WRONG[arguments] in err
+    assert len(err.strip().splitlines()) == 1
+    assert "Traceback" not in out + err
     assert not list(elsewhere.iterdir()), "something was left behind"
 
 
@@ -102,16 +104,17 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
     caplog.set_level(logging.INFO, "snarfcli")
     defaults = OmegaConf.to_container(OmegaConf.load(config_folder() / "reproduce" / "reproduce.yaml"))
     defaults.pop("defaults")
-    config = ReproduceConfig(**defaults | dict(
-        what="table1", subjects=["toy"], training="smoke", systems=["back_d", "fast_snarf-broyden", "ours-local"],
-        data_root=str(tmp_path / "data"), output_root=str(tmp_path / "outputs"), figure_resolution=16, threads=1,
-        extra=["training.steps=3", "training.validate_every=3", "skinning.resolution=[8,8,8]", "shape.width=16",
+    config = ReproduceConfig(**defaults | {
+        "what": "table1", "subjects": ["toy"], "training": "smoke", "systems": ["back_d", "fast_snarf-broyden", "ours-local"],
+        "data_root": str(tmp_path / "data"), "output_root": str(tmp_path / "outputs"), "figure_resolution": 16, "threads": 1,
+        "extra": ["training.steps=3", "training.validate_every=3", "skinning.resolution=[8,8,8]", "shape.width=16",
                "skinning.bone_radius_m=0.3"],
-    ))  # fmt: skip
+    })  # fmt: skip
     calls = []
 
     def launch(jobs, folder, launcher, on_change):
         for number, job in enumerate(jobs):
+
             def runner(arguments, log, stopped, job=job):
                 calls.append((job.row, arguments[0]))
                 if job.row == "back_d":
@@ -126,14 +129,16 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
     assert [call for call in calls if call[0] == "ours-local"] == [("ours-local", name) for name in ("train", "eval", "eval")]
     folder = tmp_path / "outputs/reproduce/table1"
     text = (folder / "table1.md").read_text()
-    assert "| Back-D | failed | failed |" in text and "- Back-D, subject toy, seed 0: failed: train: no such luck" in text
+    assert "| Back-D | failed | failed |" in text
+    assert "- Back-D, subject toy, seed 0: failed: train: no such luck" in text
     rows = list(csv.DictReader(io.StringIO((folder / "table1.csv").read_text())))
     of_runs = {row["row"]: row for row in rows if row["level"] == "run"}
     assert {row: of_runs[row]["state"] for row in of_runs} == {
         "back_d": "failed", "fast_snarf-broyden": "done", "ours-local": "done",
     }  # fmt: skip
     assert all(0 <= float(of_runs["ours-local"][name]) <= 100 for name in ("bbox_id", "surface_id", "bbox_ood", "surface_ood"))
-    assert (folder / of_runs["ours-local"]["ood_file"]).is_file() and (folder / "figures/systems.png").is_file()
+    assert (folder / of_runs["ours-local"]["ood_file"]).is_file()
+    assert (folder / "figures/systems.png").is_file()
     assert "1 of 3: Back-D, subject toy, seed 0: failed (train: no such luck)" in caplog.text
     assert "IoU in/out of distribution" in caplog.text
 
@@ -142,5 +147,6 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
     assert set(calls) == {("back_d", "train")}, "what is done is not done again"
     again = ReproduceConfig(**asdict(config) | {"only_report": True, "systems": ["ours-local", "nasa"], "figures": False})
     calls.clear()
-    assert run(again) == 1 and calls == []
+    assert run(again) == 1
+    assert calls == []
     assert "| NASA | missing | missing |" in (folder / "table1.md").read_text()

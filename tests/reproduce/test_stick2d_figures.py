@@ -80,7 +80,9 @@ def test_shapes_are_drawn_beside_the_truth(store: SampleStore, tmp_path: Path, f
     fill = np.array([int(stick2d_figures._FILL[k : k + 2], 16) for k in (1, 3, 5)])
     filled = (np.abs(picture.astype(int) - fill).max(-1) < 3).any(0)
     quarter = picture.shape[1] // 4
-    assert filled[quarter : 2 * quarter].any() and not filled[:quarter].any() and not filled[2 * quarter + 40 :].any()
+    assert filled[quarter : 2 * quarter].any()
+    assert not filled[:quarter].any()
+    assert not filled[2 * quarter + 40 :].any()
 
 
 def test_curves_show_the_values(tmp_path: Path, figures: list) -> None:
@@ -96,7 +98,8 @@ def test_curves_show_the_values(tmp_path: Path, figures: list) -> None:
     forward, backward = curves.lines
     np.testing.assert_allclose(forward.get_xydata(), [[10, 99], [20, 96]])
     np.testing.assert_allclose(backward.get_xydata(), [[10, 95], [20, np.nan]])
-    assert "degrees" in curves.get_xlabel() and bars.get_ylabel() == curves.get_ylabel() == "IoU, %"
+    assert "degrees" in curves.get_xlabel()
+    assert bars.get_ylabel() == curves.get_ylabel() == "IoU, %"
     assert [text.get_text() for text in figures[0].legends[0].get_texts()] == ["forward", "backward"]
 
 

@@ -42,12 +42,15 @@ def test_means_are_over_seeds_then_subjects_and_deviations_over_seeds(plan):
     results = [result for result in make_all(plan) if result.job.row == "snarf"]
     cell = summarise(results, SURFACE)
     by_seed = [100 * (0.55 + 0.01 * seed**2) for seed in range(3)]
-    assert cell.mean == pytest.approx(statistics.mean(by_seed)) and cell.deviation == pytest.approx(statistics.stdev(by_seed))
+    assert cell.mean == pytest.approx(statistics.mean(by_seed))
+    assert cell.deviation == pytest.approx(statistics.stdev(by_seed))
     assert cell.text(1) == f"{statistics.mean(by_seed):.1f} ± {statistics.stdev(by_seed):.1f}"
     one = summarise(results[:1], SURFACE)
-    assert one.deviation is None and one.text(1) == "50.0"
+    assert one.deviation is None
+    assert one.text(1) == "50.0"
     times = {column.key: summarise(results, column).mean for column in COLUMNS}
-    assert times["training_min"] == pytest.approx(100 * 0.6 / 60) and times["total_ms"] == 31.0
+    assert times["training_min"] == pytest.approx(100 * 0.6 / 60)
+    assert times["total_ms"] == 31.0
 
 
 def test_a_failed_run_is_in_the_cell_and_not_averaged_away(plan):
@@ -58,19 +61,24 @@ def test_a_failed_run_is_in_the_cell_and_not_averaged_away(plan):
     fake_run(failed, {}, "failed", "no samples", trained=False)
     results = make_all(plan, broken)
     cell = summarise([result for result in results if result.job.row == "snarf"], SURFACE)
-    assert cell.count == 4 and cell.runs == 6 and cell.deviation is None
+    assert cell.count == 4
+    assert cell.runs == 6
+    assert cell.deviation is None
     assert re.fullmatch(r"4 of 6: [\d.]+ \(1 diverged, 1 failed\)", cell.text(1))
     alone = next(result for result in results if result.state == "diverged")
-    assert summarise([alone], SURFACE).text(1) == "diverged" and alone.reason == "train: loss is NaN at step 7"
+    assert summarise([alone], SURFACE).text(1) == "diverged"
+    assert alone.reason == "train: loss is NaN at step 7"
     text = markdown_table(plan, results, lambda result, stage: None)
-    assert "4 of 6:" in text and "(1 diverged, 1 failed)" in text
+    assert "4 of 6:" in text
+    assert "(1 diverged, 1 failed)" in text
     assert any("not known, since not all runs are done" in line for line in order_lines(plan, results))
 
 
 def test_runs_that_are_not_there_are_missing(plan):
     results = [collect(job) for job in plan.jobs]
     assert {result.state for result in results} == {"missing"}
-    assert summarise(results, SURFACE).text(1) == "12 missing" and summarise(results[:1], SURFACE).text(1) == "missing"
+    assert summarise(results, SURFACE).text(1) == "12 missing"
+    assert summarise(results[:1], SURFACE).text(1) == "missing"
 
 
 def test_only_numbers_of_the_same_settings_count(plan, tmp_path):
@@ -82,14 +90,16 @@ def test_only_numbers_of_the_same_settings_count(plan, tmp_path):
     status = read(tmp_path / "outputs/builtin/50002/snarf-quick-s0" / STATUS)
     assert status["digest"] == job.digest
     longer = fake_plan(tmp_path, systems=("snarf",), training="standard")
-    assert longer.jobs[0].digest != job.digest and longer.jobs[0].folder != job.folder
+    assert longer.jobs[0].digest != job.digest
+    assert longer.jobs[0].folder != job.folder
 
 
 def test_data_without_a_split_has_a_dash(tmp_path):
     plan = fake_plan(tmp_path, systems=("snarf",))
     fake_run(plan.jobs[0], {"id": 0.9})
     result = collect(plan.jobs[0])
-    assert result.state == "done" and summarise([result], SURFACE).text(1) == "–"
+    assert result.state == "done"
+    assert summarise([result], SURFACE).text(1) == "–"
 
 
 def test_the_report_links_every_number_to_a_file_and_equals_its_csv(plan, tmp_path):
@@ -145,7 +155,8 @@ def test_the_order_of_the_papers_is_compared(plan):
 
 def test_the_terminal_shows_the_papers_numbers_too(plan):
     text = plain_table(plan, make_all(plan))
-    assert "(80.65)" in text and len({len(line) for line in text.splitlines()} - {0}) >= 1
+    assert "(80.65)" in text
+    assert len({len(line) for line in text.splitlines()} - {0}) >= 1
     assert csv_table(plan, [collect(job) for job in plan.jobs], lambda result, stage: None)
 
 
@@ -157,5 +168,7 @@ def test_the_papers_averages_are_near_the_means_of_their_subjects():
         for key in ("bbox_id", "surface_id", "bbox_ood", "surface_ood"):
             # the table's own averages are up to 0.86 off, at NASA's and Back-LBS's
             assert statistics.mean(value[key] for value in values) == pytest.approx(mean[key], abs=0.9)
-    assert paper_numbers("table2", "grid128")["surface_ood"] == 81.5 and paper_source("table2") == "Fast-SNARF Table 2"
-    assert paper_numbers("ablations", "snarf") == {} and paper_numbers("table1", "fast_snarf", "50002") == {}
+    assert paper_numbers("table2", "grid128")["surface_ood"] == 81.5
+    assert paper_source("table2") == "Fast-SNARF Table 2"
+    assert paper_numbers("ablations", "snarf") == {}
+    assert paper_numbers("table1", "fast_snarf", "50002") == {}

@@ -96,11 +96,13 @@ def test_points_and_labels_come_back(folder: Path) -> None:
         made = _frame(frame)
         wanted = dequantise(made.points, made.cube_lower, made.cube_size)
         points, labels = walk.points(frame), walk.occupancies(frame)
-        assert points.dtype == np.float32 and labels.dtype == bool
+        assert points.dtype == np.float32
+        assert labels.dtype == bool
         np.testing.assert_array_equal(points, wanted)  # bit for bit: labels were made for these
         np.testing.assert_array_equal(labels, made.occupied)
         lower, upper = walk.cube(frame)
-        assert (points >= lower).all() and (points <= upper).all()
+        assert (points >= lower).all()
+        assert (points <= upper).all()
     assert walk.points(np.arange(3)).shape == (3, _POINTS, 3)
     assert walk.occupancies(np.arange(3)).shape == (3, _POINTS)
 
@@ -133,8 +135,10 @@ def test_the_rest_comes_back(folder: Path) -> None:
         np.testing.assert_array_equal(walk.box(frame), (made.box_lower, made.box_upper))
     assert walk.description["boundary_edges"] == 2
     assert np.load(folder / "train" / "walk" / "faces.npy").shape == (4 + 5 + 6, 3)  # each topology once
-    assert store.skeleton.names == ("root", "middle") and store.skeleton.parents == (-1, 0)
-    assert store.template.faces.shape == (4, 3) and store.template.vertices.shape == (5, 3)
+    assert store.skeleton.names == ("root", "middle")
+    assert store.skeleton.parents == (-1, 0)
+    assert store.template.faces.shape == (4, 3)
+    assert store.template.vertices.shape == (5, 3)
     assert store.template.weights.shape == (5, 2)
     assert [sequence.name for sequence in store.sequences("test")] == ["hop"]
 
@@ -175,10 +179,11 @@ def test_a_single_frame_is_for_training(tmp_path: Path) -> None:
 def test_manifest_says_what_is_there(folder: Path) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["format_version"] == FORMAT_VERSION
-    assert manifest["settings"] == _SETTINGS and manifest["settings_digest"] == settings_digest(_SETTINGS)
+    assert manifest["settings"] == _SETTINGS
+    assert manifest["settings_digest"] == settings_digest(_SETTINGS)
     assert manifest["frames"] == {"train": 23, "test": 2, "ood": 0}
     assert manifest["points"] == 25 * _POINTS
-    files = [path for path in folder.rglob("*.np?")]
+    files = list(folder.rglob("*.np?"))
     assert manifest["bytes"] == sum(path.stat().st_size for path in files)
     inside = sum(_frame(f).occupied.sum() for n in (20, 3, 2) for f in range(n))
     assert manifest["inside_share"] == pytest.approx(inside / manifest["points"])

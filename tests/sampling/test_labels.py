@@ -65,7 +65,8 @@ def check_labels(vertices: np.ndarray, faces: np.ndarray, boundary_edges: int) -
 @pytest.mark.parametrize("pose", ["hops", "squats"])
 def test_labels_of_the_body_are_exact(posed, pose: str) -> None:
     vertices, faces = posed[pose]
-    assert len(vertices) == 6890 and count_boundary_edges(faces) == 0
+    assert len(vertices) == 6890
+    assert count_boundary_edges(faces) == 0
     points, exact = check_labels(vertices, faces, 0)
     some = np.random.default_rng(0).choice(len(points), 100, replace=False)
     # libigl adds the same angles in another order; 13,776 terms

@@ -49,7 +49,8 @@ def test_overlap_is_inside_by_winding_and_outside_by_parity() -> None:
     overlap = np.rint(winding) == 2
     common = 16 / 3 * radius**3 / 1.5**3  # Steinmetz solid
     assert abs(overlap.mean() - common) < _tolerance(common) + 0.01 * common  # 1 %: polygons of 64 corners
-    assert (union[overlap]).all() and not exclusive[overlap].any()
+    assert (union[overlap]).all()
+    assert not exclusive[overlap].any()
     np.testing.assert_array_equal(union & ~overlap, exclusive)
     np.testing.assert_array_equal(labels_differ(winding), overlap)
     separate = mesh_volume(vertices, faces) / 1.5**3
@@ -67,7 +68,8 @@ def test_open_mesh_is_labelled_by_winding_number() -> None:
     assert check_mesh(vertices, faces) == 0
     opened = np.delete(faces, [10, 11], axis=0)
     edges = count_boundary_edges(opened)
-    assert edges > 0 and check_mesh(vertices, opened) == edges
+    assert edges > 0
+    assert check_mesh(vertices, opened) == edges
     points = _uniform(-0.4, 1.0)[:2000]
     import igl
 

@@ -39,7 +39,8 @@ RECTANGLE = prism(np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 0.5], [0.0, 0.5]]), np
 
 def test_outline_is_sampled_evenly() -> None:
     points = outline_samples(*RECTANGLE, 5000, np.random.default_rng(0))
-    assert points.shape == (5000, 3) and not points[:, 2].any()
+    assert points.shape == (5000, 3)
+    assert not points[:, 2].any()
     x, y = points[:, 0], points[:, 1]
     gap = np.minimum(np.minimum(np.abs(x), np.abs(x - 2)), np.minimum(np.abs(y), np.abs(y - 0.5)))
     assert gap.max() < 1e-9
@@ -66,7 +67,8 @@ def test_frame_lies_exactly_on_the_plane() -> None:
     uniform, near = points[:2000, :2], points[2000:, :2]
     assert np.ptp(uniform, axis=0).min() > 2.15
     away = np.abs(near - np.clip(near, 0, [2, 0.5])).max(1)[~inside[2000:]]
-    assert 0.003 < away.mean() < 0.02 and 0.4 < inside[2000:].mean() < 0.6
+    assert 0.003 < away.mean() < 0.02
+    assert 0.4 < inside[2000:].mean() < 0.6
 
 
 def test_spatial_frames_are_as_before() -> None:
@@ -88,7 +90,8 @@ def test_a_fold_is_inside_where_the_winding_number_cancels() -> None:
     points = np.column_stack([generator.uniform([-0.2, 0.01], [1.2, 0.99], (800, 2)), np.zeros(800)])
     winding = np.rint(winding_numbers(vertices, faces, points))
     folded = (points[:, 0] > 0.6) & (points[:, 0] < 1)
-    assert (winding[folded] == 0).all() and folded.any()  # once each way
+    assert (winding[folded] == 0).all()
+    assert folded.any()
     np.testing.assert_array_equal(in_turned_over(vertices, faces, points), folded)
     union = (winding > 0.5) | in_turned_over(vertices, faces, points)
     np.testing.assert_array_equal(union, (points[:, 0] > 0) & (points[:, 0] < 1))

@@ -42,7 +42,8 @@ def test_quantisation_keeps_points_within_half_a_step() -> None:
     points = lower + generator.random((5000, 3)) * size
     cells = quantise(points, lower, size)
     back = dequantise(cells, lower, size)
-    assert cells.dtype == np.uint16 and back.dtype == np.float32
+    assert cells.dtype == np.uint16
+    assert back.dtype == np.float32
     assert np.abs(back - points).max() <= size / 65536 * 0.5 + 3e-7  # fp32 rounding at 3 m
     np.testing.assert_array_equal(quantise(back.astype(np.float64), lower, size), cells)
     outside = np.array([[-9.0, 9, 9], [-3, 1, 0.5]])
@@ -55,7 +56,8 @@ def test_surface_samples_lie_evenly_on_the_surface(count: int) -> None:
     points = surface_samples(vertices, faces, count, np.random.default_rng(1))
     assert points.shape == (count, 3)
     radius = np.linalg.norm(points, axis=1)
-    assert radius.max() <= 0.5 + 1e-6 and radius.min() > 0.5 * np.cos(np.pi / 24) * np.cos(np.pi / 48) - 1e-6
+    assert radius.max() <= 0.5 + 1e-6
+    assert radius.min() > 0.5 * np.cos(np.pi / 24) * np.cos(np.pi / 48) - 1e-6
     if count > 1000:
         octants = np.bincount((points > 0) @ [1, 2, 4], minlength=8)
         assert np.abs(octants / count - 1 / 8).max() < 0.01  # Poisson disks: far below the 0.018 of chance (3 sigma)
@@ -69,7 +71,8 @@ def test_missing_samples_are_drawn_from_the_faces(monkeypatch: pytest.MonkeyPatc
     points = surface_samples(vertices, faces, 2000, np.random.default_rng(1))
     assert points.shape == (2000, 3)
     distance = np.linalg.norm(points - np.clip(points[:, :1], 0, 0.5) * [1, 0, 0], axis=1)
-    assert distance.max() <= 0.1 + 1e-6 and distance.min() > 0.096
+    assert distance.max() <= 0.1 + 1e-6
+    assert distance.min() > 0.096
     assert abs((points[:, 0] < 0.25).mean() - 0.5) < 0.03
 
 
@@ -78,7 +81,7 @@ def test_a_surface_without_area_is_refused() -> None:
         surface_samples(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10, np.random.default_rng(0))
     for height in (1e-18, 1e-160):  # MeshLab would go on for ever
         thin = np.array([[0, 0, 0], [1, 0, 0], [0.5, height, 0]])
-        with pytest.raises(UserError, match="next to no area .*, 1 m long"):
+        with pytest.raises(UserError, match=r"next to no area .*, 1 m long"):
             surface_samples(thin, np.array([[0, 1, 2]]), 10_000, np.random.default_rng(0))
 
 
@@ -115,12 +118,14 @@ def test_a_frame_that_cannot_be_used_is_named(scale: list[float], message: str, 
     *good, broken = sample_frames(meshes, settings, ("fox", "walk"), [7, 8] if first else [5, 7, 8])
     assert len(good) == (0 if first else 1)
     message = message.replace("frame 7", f"frame 7 \\({file}\\)") if file else message
-    assert isinstance(broken, BrokenFrame) and re.match(message, broken.message)
+    assert isinstance(broken, BrokenFrame)
+    assert re.match(message, broken.message)
     checks = list(check_frames(meshes, "winding", "walk", [7, 8] if first else [5, 7, 8]))
     if "no area" in message:
         assert checks == [None] * len(meshes)  # that shows when it is sampled
     else:
-        assert len(checks) == len(good) + 1 and checks[-1] == broken
+        assert len(checks) == len(good) + 1
+        assert checks[-1] == broken
 
 
 def test_frame_has_both_kinds_of_points() -> None:
@@ -128,7 +133,8 @@ def test_frame_has_both_kinds_of_points() -> None:
     samples = sample_frame(vertices, faces, _SETTINGS, frame_generator(0, "a", 3))
     points = dequantise(samples.points, samples.cube_lower, samples.cube_size)
     uniform, near = points[:4000], points[4000:]
-    assert points.shape == (8000, 3) and samples.occupied.shape == (8000,)
+    assert points.shape == (8000, 3)
+    assert samples.occupied.shape == (8000,)
     for axis in range(3):
         counts = np.histogram(uniform[:, axis], bins=8, range=(-0.55, 0.55))[0]
         assert ((counts - 500) ** 2 / 500).sum() < 24.3  # chi square, 7 degrees of freedom, one in a thousand
@@ -156,7 +162,8 @@ def test_noise_beyond_the_cube_stays_on_its_border() -> None:
     vertices, faces = capsule_mesh(0.0, 0.02)
     samples = sample_frame(vertices, faces, replace(_SETTINGS, surface_noise_m=0.05), frame_generator(0))
     points = dequantise(samples.points, samples.cube_lower, samples.cube_size)
-    assert (points >= samples.cube_lower).all() and (points <= samples.cube_lower + samples.cube_size).all()
+    assert (points >= samples.cube_lower).all()
+    assert (points <= samples.cube_lower + samples.cube_size).all()
     np.testing.assert_array_equal(samples.occupied, winding_numbers(vertices, faces, points) > 0.5)
 
 

@@ -78,7 +78,8 @@ def test_a_point_does_not_depend_on_the_others(count):
         every = evaluate(network, points, condition, pose)
         part = evaluate(network, points[:count], condition, pose[:count])
         strided = evaluate(network, points.T.contiguous().T[:count], condition, pose[:count])
-    assert torch.equal(part, every[:count]) and torch.equal(strided, every[:count])
+    assert torch.equal(part, every[:count])
+    assert torch.equal(strided, every[:count])
 
 
 def test_far_steep_and_broken_points():
@@ -89,7 +90,8 @@ def test_far_steep_and_broken_points():
     with torch.no_grad():
         wanted, got = network(points, condition, pose), evaluate(network, points, condition, pose)
     torch.testing.assert_close(got[:2], wanted[:2], rtol=1e-5, atol=1e-5)
-    assert not got[2:].isfinite().any() and not wanted[2:].isfinite().any()
+    assert not got[2:].isfinite().any()
+    assert not wanted[2:].isfinite().any()
 
 
 def test_waves_of_large_angles():

@@ -20,16 +20,19 @@ def test_far_points_are_outside_the_cubes(tmp_path):
     count = batch.points.shape[1]
     for given in (batch, tight):
         more = trainer._with_far_points(given)
-        assert torch.equal(more.points[:, :count], batch.points) and torch.equal(more.occupied[:, :count], batch.occupied)
+        assert torch.equal(more.points[:, :count], batch.points)
+        assert torch.equal(more.occupied[:, :count], batch.occupied)
         far = more.points[:, count:]
-        assert far.shape == (config.poses_per_step, 400, 3) and not more.occupied[:, count:].any()
+        assert far.shape == (config.poses_per_step, 400, 3)
+        assert not more.occupied[:, count:].any()
         outside = (far < given.cube[:, None, 0]) | (far > given.cube[:, None, 1])
         assert outside.any(-1).all()
     # those that were moved there by the bones are found again by the search; the others have no candidate
     found = trainer.model.deformer(far, batch.bone_transforms)
     reached = found.found
     assert 0.05 < reached.float().mean() < 0.95
-    assert (far[~reached].norm(dim=1) > 5).all() and (far[reached].norm(dim=1) < 3).all()
+    assert (far[~reached].norm(dim=1) > 5).all()
+    assert (far[reached].norm(dim=1) < 3).all()
     again = trainer._with_far_points(tight)
     assert torch.equal(again.points, more.points)  # a resumed run draws the same
 

@@ -87,7 +87,9 @@ def test_trains_saves_evaluates_and_poses(config_for, name, softmax):
     anywhere = box_c[0] + torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) * (box_c[1] - box_c[0])
     inside = anywhere[avatar.canonical_logits(anywhere, avatar.skeleton.canonical_pose) > 0]
     posed, (lower, upper) = avatar.skin(inside, transforms[0]), avatar.posed_box(transforms[0])
-    assert len(inside) and bool((posed >= lower).all()) and bool((posed <= upper).all())
+    assert len(inside)
+    assert bool((posed >= lower).all())
+    assert bool((posed <= upper).all())
     for surface in ("field", "skinned"):
         assert len(avatar.mesh(pose, resolution=24, surface=surface).faces) > 20
 
@@ -100,7 +102,8 @@ def test_preset_weights_do_not_change_and_the_others_do(config_for, store):
         numbers = trainer.advance()
         after = trainer.model.deformer.field.state_dict()
         assert all(torch.equal(before[key], after[key]) for key in before) == (name == "preset")
-        assert ("smoothness" in numbers) == (name == "voxel") and ("joint_weight" in numbers) == (name != "preset")
+        assert ("smoothness" in numbers) == (name == "voxel")
+        assert ("joint_weight" in numbers) == (name != "preset")
 
 
 def test_hierarchical_weights_learn_the_joint_target(config_for, store):
@@ -152,5 +155,5 @@ def test_settings_that_do_not_fit_make_nothing(config_for, changes, message):
 def test_a_field_without_cells_is_not_evaluated_cell_by_cell(config_for):
     config = config_for("mlp")
     run(config)
-    with pytest.raises(UserError, match="'mlp' needs search.name 'broyden', got 'complete'.*; leave search out"):
+    with pytest.raises(UserError, match=r"'mlp' needs search.name 'broyden', got 'complete'.*; leave search out"):
         evaluate(eval_config(config, SearchConfig("complete")))

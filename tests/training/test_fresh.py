@@ -80,7 +80,8 @@ def check_labels(fresh: FreshPoints, steps: int) -> None:
         for (sequence, frame), points, occupied in zip(drawn.frames, drawn.points, drawn.occupied, strict=True):
             np.testing.assert_array_equal(occupied, exact_labels(fresh.sequences[sequence], frame, points))
             lower, upper = fresh.sequences[sequence].cube(frame)
-            assert (points >= lower).all() and (points <= upper).all()
+            assert (points >= lower).all()
+            assert (points <= upper).all()
 
 
 def test_points_lie_as_the_stored_ones_do(store) -> None:
@@ -188,7 +189,7 @@ def test_a_failure_of_a_worker_ends_the_training_in_one_line(tmp_path) -> None:
         return numbers
 
     trainer.advance = advance_and_lose_the_samples
-    with pytest.raises(UserError, match="the samples are damaged: .*points.npy is missing") as caught:
+    with pytest.raises(UserError, match=r"the samples are damaged: .*points.npy is missing") as caught:
         train(trainer, tmp_path, on_scalars=lambda step, numbers: None)
     assert "\n" not in str(caught.value)
 

@@ -43,12 +43,14 @@ def test_joint_weight_targets(target, last):
 
 
 def test_unknown_joint_target_is_refused():
-    with pytest.raises(ValueError, match="training.joint_target must be one of halves, parent, own, got 'both'"):
+    with pytest.raises(ValueError, match=r"training.joint_target must be one of halves, parent, own, got 'both'"):
         joint_weight_targets([-1], "both")
 
 
 def test_points_lie_on_their_bones():
     bones = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]], [[1.0, 0, 0], [1.0, 2.0, 0]]])
     points = points_on_bones(bones, 50, torch.Generator().manual_seed(0)).reshape(2, 50, 3)
-    assert bool((points[0, :, 1:] == 0).all()) and bool(((points[0, :, 0] >= 0) & (points[0, :, 0] <= 1)).all())
-    assert bool((points[1, :, 0] == 1).all()) and float(points[1, :, 1].std()) > 0.3
+    assert bool((points[0, :, 1:] == 0).all())
+    assert bool(((points[0, :, 0] >= 0) & (points[0, :, 0] <= 1)).all())
+    assert bool((points[1, :, 0] == 1).all())
+    assert float(points[1, :, 1].std()) > 0.3

@@ -81,7 +81,8 @@ def test_every_system_trains_evaluates_and_moves(config_for, name, tmp_path):
     assert json.loads((folder / "metrics.json").read_text())["status"] == "trained"
     evaluate(eval_config(config))
     metrics = json.loads((folder / "eval_ood_part" / "metrics.json").read_text())
-    assert metrics["model"] == name and 0 <= metrics["iou_bbox"] <= 1
+    assert metrics["model"] == name
+    assert 0 <= metrics["iou_bbox"] <= 1
     np.savez(tmp_path / "pose.npz", poses=np.zeros((2, 2, 3)))
     code = animate.run(animate_config(config, tmp_path / "pose.npz"))
     meshes = list((folder / "animation" / "pose").glob("*.ply"))
@@ -130,7 +131,7 @@ def test_settings_of_a_system_that_cannot_be_used_are_refused(config_for):
     for condition in (ConditionConfig("local", layer=config.shape.depth), ConditionConfig("global", layer=-1)):
         with pytest.raises(UserError, match=f"condition.layer must be between 0 and {config.shape.depth - 1}"):
             run(replace(config, condition=condition))
-    with pytest.raises(UserError, match="condition.size must be at least 1, got 0"):
+    with pytest.raises(UserError, match=r"condition.size must be at least 1, got 0"):
         run(replace(config, condition=ConditionConfig("local", size=0)))
     assert not Path(config.output_root).exists()
 

@@ -89,5 +89,6 @@ def test_the_body_is_seen_posed_and_played_and_nothing_comes_from_elsewhere(page
     page.get_by_text("bend", exact=True).click()
     page.get_by_text("Pause").click()
     page.get_by_text("Play", exact=True).wait_for()
-    assert page.server.viewing.motion.name == "bend" and not page.server.viewing.player.is_playing
+    assert page.server.viewing.motion.name == "bend"
+    assert not page.server.viewing.player.is_playing
     assert not page.foreign

@@ -37,7 +37,9 @@ def test_joints_are_listed_limb_by_limb(person):
     assert sorted(labels.values()) == list(range(1, 24))
     limbs = list(dict.fromkeys(label.split(":")[0] for label in labels))
     assert limbs == ["trunk", "head", "left arm", "right arm", "left leg", "right leg"]
-    assert labels["left arm: elbow"] == 18 and labels["right leg: knee"] == 5 and labels["trunk: spine3"] == 9
+    assert labels["left arm: elbow"] == 18
+    assert labels["right leg: knee"] == 5
+    assert labels["trunk: spine3"] == 9
 
 
 def test_joints_that_are_no_part_of_a_person_keep_their_names():

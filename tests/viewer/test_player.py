@@ -22,11 +22,14 @@ def test_frames_follow_the_clock(player):
 def test_the_end_stops_what_does_not_loop(player):
     player.change_looping(False, 0.0)
     player.play(0.0)
-    assert player.frame(0.39) == 3 and player.is_playing
-    assert player.frame(7.0) == 4 and not player.is_playing
+    assert player.frame(0.39) == 3
+    assert player.is_playing
+    assert player.frame(7.0) == 4
+    assert not player.is_playing
     assert player.seconds_to_next(7.0) is None
     player.play(8.0)  # from the start again
-    assert player.frame(8.0) == 0 and player.frame(8.1) == 1
+    assert player.frame(8.0) == 0
+    assert player.frame(8.1) == 1
 
 
 def test_a_pause_keeps_the_frame(player):
@@ -34,7 +37,8 @@ def test_a_pause_keeps_the_frame(player):
     player.pause(0.33)
     assert player.frame(99.0) == 3
     player.play(100.0)
-    assert player.frame(100.0) == 3 and player.frame(100.1) == 4
+    assert player.frame(100.0) == 3
+    assert player.frame(100.1) == 4
 
 
 def test_seeking_and_speed(player):
@@ -45,7 +49,8 @@ def test_seeking_and_speed(player):
     player.seek(0, 0.0)
     player.play(0.0)
     player.change_speed(0.5, 0.2)  # two frames at the full pace, then half of it
-    assert player.frame(0.39) == 2 and player.frame(0.41) == 3
+    assert player.frame(0.39) == 2
+    assert player.frame(0.41) == 3
     assert player.seconds_to_next(0.2) == pytest.approx(0.2)
     player.change_looping(False, 0.45)
     assert player.frame(0.45) == 3
@@ -54,7 +59,11 @@ def test_seeking_and_speed(player):
 def test_nothing_to_play():
     player = Player()
     player.play(0.0)
-    assert not player.is_playing and player.frame(5.0) == 0 and player.seconds_to_next(5.0) is None
+    assert not player.is_playing
+    assert player.frame(5.0) == 0
+    assert player.seconds_to_next(5.0) is None
     player.load(1, 30.0)  # a pose
     player.play(0.0)
-    assert not player.is_playing and player.frame(9.0) == 0 and player.seconds_to_next(9.0) is None
+    assert not player.is_playing
+    assert player.frame(9.0) == 0
+    assert player.seconds_to_next(9.0) is None

@@ -58,9 +58,11 @@ def test_a_look_that_changes_between_picture_and_stage_is_not_lost(scene, watche
     picture = watched.picture()
     watched.viewing.change_look(weight_colors=True, shows_skeleton=True)
     scene.show(picture)
-    assert scene._body._plain.visible and scene._joints is None
+    assert scene._body._plain.visible
+    assert scene._joints is None
     show_settled(scene, watched)
-    assert not scene._body._plain.visible and scene._joints.visible
+    assert not scene._body._plain.visible
+    assert scene._joints.visible
     assert [node.visible for node in scene._body._colored if node is not None] == [True]
 
 

@@ -21,7 +21,7 @@ from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
 
-from viser_page import Page  # noqa: E402
+from viser_page import Page
 
 FACTS = {"subject": "toy", "data": "none", "model": "capsules", "joints": "2"}
 
@@ -56,8 +56,10 @@ def server():
 def test_the_page_is_served_on_this_machine_only_and_needs_no_other(server):
     with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/", timeout=60) as answer:
         page = answer.read()
-    assert answer.status == 200 and b"<html" in page
-    assert b'src="http' not in page and b'href="http' not in page
+    assert answer.status == 200
+    assert b"<html" in page
+    assert b'src="http' not in page
+    assert b'href="http' not in page
     assert server.server.get_host() == "127.0.0.1"
 
 
@@ -186,7 +188,8 @@ def test_an_avatar_without_weights_has_no_choice_of_surface():
             page.until_text("made in")
             inputs = [message["props"] for message in page.messages if "label" in message.get("props", {})]
             shown = {props["label"]: props for props in inputs}
-            assert not shown["Weights in colour"]["visible"] and not shown["Canonical shape beside it"]["visible"]
+            assert not shown["Weights in colour"]["visible"]
+            assert not shown["Canonical shape beside it"]["visible"]
             assert shown["Surface"]["options"] == ["field"]
     finally:
         server.stop()
@@ -212,7 +215,7 @@ def test_a_port_in_use_names_the_next_one(server):
     with pytest.raises(UserError, match="is in use"):
         ViewServer(ToyAvatar(), SMALL, port=server.port)
     check_port("127.0.0.1", 0)
-    with pytest.raises(UserError, match="host 203.0.113.7 is no address of this machine"):  # RFC 5737: of no machine
+    with pytest.raises(UserError, match=r"host 203.0.113.7 is no address of this machine"):  # RFC 5737: of no machine
         check_port("203.0.113.7", 8080)
 
 
@@ -242,5 +245,9 @@ def test_a_browser_is_opened_only_where_it_is_seen(environment, platform, can):
 
 
 def test_loopback():
-    assert is_loopback("127.0.0.1") and is_loopback("localhost") and is_loopback("::1")
-    assert not is_loopback("0.0.0.0") and not is_loopback("192.168.0.2") and not is_loopback("example.org")
+    assert is_loopback("127.0.0.1")
+    assert is_loopback("localhost")
+    assert is_loopback("::1")
+    assert not is_loopback("0.0.0.0")
+    assert not is_loopback("192.168.0.2")
+    assert not is_loopback("example.org")

@@ -36,9 +36,13 @@ def bending(frames: int = 4, rate: float = 10.0) -> Motion:
 
 def test_the_first_picture_has_no_surface_and_the_next_one_stands_on_the_floor(watched):
     first = watched.picture()
-    assert first.mesh is None and first.is_computing and first.message is None
+    assert first.mesh is None
+    assert first.is_computing
+    assert first.message is None
     picture = watched.settled()
-    assert picture.mesh.surface == "skinned" and picture.mesh.weights is None and picture.canonical is None
+    assert picture.mesh.surface == "skinned"
+    assert picture.mesh.weights is None
+    assert picture.canonical is None
     assert picture.mesh.vertices[:, 1].min() == pytest.approx(watched.viewing.floor_y, abs=1e-4)
 
 
@@ -46,7 +50,8 @@ def test_a_turned_joint_moves_the_skin_at_once(watched):
     before = watched.settled().mesh
     watched.viewing.turn_joint(1, BEND)
     after = watched.picture().mesh
-    assert after.faces is before.faces and after.posed.pose[1, 2] == 0.9
+    assert after.faces is before.faces
+    assert after.posed.pose[1, 2] == 0.9
     exact = SkinnedSurface(watched.avatar, 24).posed(torch.from_numpy(after.posed.pose).float())
     np.testing.assert_allclose(watched.settled().mesh.vertices, exact.vertices, atol=1e-5)
 
@@ -64,11 +69,13 @@ def test_the_shape_of_the_pose_comes_when_it_is_made(watched, monkeypatch):
     watched.viewing.turn_joint(1, np.zeros(3))  # the same pose, chosen anew
     after = watched.settled().mesh
     np.testing.assert_allclose(np.linalg.norm(after.vertices - before, axis=1), 0.01, atol=1e-3)
-    assert grown == [0.0] and after.seconds is not None
+    assert grown == [0.0]
+    assert after.seconds is not None
     watched.viewing.change_look(has_pose_shape=False)
     plain = watched.settled().mesh
     np.testing.assert_allclose(plain.vertices, before, atol=1e-5)
-    assert grown == [0.0] and plain.seconds is None
+    assert grown == [0.0]
+    assert plain.seconds is None
 
 
 def test_a_field_is_made_for_the_latest_pose_only(watched, monkeypatch):
@@ -85,7 +92,8 @@ def test_a_field_is_made_for_the_latest_pose_only(watched, monkeypatch):
     monkeypatch.setattr(watched.viewing._worker, "_work", slow)
     watched.viewing.change_look(surface="field")
     picture = watched.picture()
-    assert picture.is_computing and picture.mesh.surface == "skinned"  # meanwhile
+    assert picture.is_computing
+    assert picture.mesh.surface == "skinned"
     assert begun.wait(PATIENCE)
     for angle in (0.1, 0.2, 0.3):
         watched.viewing.turn_joint(1, angle * BEND / 0.9)
@@ -93,15 +101,18 @@ def test_a_field_is_made_for_the_latest_pose_only(watched, monkeypatch):
     go_on.set()
     picture = watched.settled()
     assert made == [0, pytest.approx(0.3)]
-    assert picture.mesh.surface == "field" and picture.mesh.seconds > 0
-    assert picture.mesh.posed.pose[1, 2] == pytest.approx(0.3) and picture.mesh.vertices[:, 1].max() > RADIUS
+    assert picture.mesh.surface == "field"
+    assert picture.mesh.seconds > 0
+    assert picture.mesh.posed.pose[1, 2] == pytest.approx(0.3)
+    assert picture.mesh.vertices[:, 1].max() > RADIUS
     assert watched.picture().mesh.faces is picture.mesh.faces
 
 
 def test_a_field_in_colour_has_weights_and_another_resolution_is_made_anew(watched):
     watched.viewing.change_look(surface="field", weight_colors=True)
     coarse = watched.settled().mesh
-    assert coarse.surface == "field" and coarse.weights.shape == (len(coarse.vertices), 2)
+    assert coarse.surface == "field"
+    assert coarse.weights.shape == (len(coarse.vertices), 2)
     watched.viewing.change_look(field_resolution=40)
     assert len(watched.settled().mesh.vertices) > 1.5 * len(coarse.vertices)
     watched.viewing.change_look(surface="skinned", skinned_resolution=40)
@@ -122,9 +133,11 @@ def test_a_pose_without_surface_is_told_and_the_viewer_goes_on(watched, caplog):
     assert watched.settled().message is None
     watched.viewing.turn_joint(1, BEND)
     picture = watched.settled()
-    assert "unoccupied" in picture.message and picture.mesh.surface == "skinned"
+    assert "unoccupied" in picture.message
+    assert picture.mesh.surface == "skinned"
     watched.viewing.turn_joint(1, BEND / 2)
-    assert watched.settled().message is None and watched.settled().mesh.surface == "field"
+    assert watched.settled().message is None
+    assert watched.settled().mesh.surface == "field"
     assert not caplog.records
 
     def broken(points, transforms, pose):
@@ -139,7 +152,8 @@ def test_a_pose_without_surface_is_told_and_the_viewer_goes_on(watched, caplog):
 def test_an_avatar_without_any_surface_is_told_too():
     watched = Watched(ToyAvatar(radius=-1.0))
     picture = watched.settled()
-    assert picture.mesh is None and picture.message
+    assert picture.mesh is None
+    assert picture.message
     watched.viewing.stop()
 
 
@@ -148,10 +162,13 @@ def test_an_avatar_without_weights_shows_its_field_only():
     avatar.model.has_skinning_weights = False
     watched = Watched(avatar, replace(SMALL, weight_colors=True, shows_canonical=True))
     first = watched.settled()
-    assert first.mesh.surface == "field" and first.mesh.weights is None and first.canonical is None
+    assert first.mesh.surface == "field"
+    assert first.mesh.weights is None
+    assert first.canonical is None
     watched.viewing.turn_joint(1, BEND)
     meanwhile = watched.picture()
-    assert meanwhile.is_computing and meanwhile.mesh.posed is first.mesh.posed  # better than nothing
+    assert meanwhile.is_computing
+    assert meanwhile.mesh.posed is first.mesh.posed
     assert watched.settled().mesh.posed.pose[1, 2] == 0.9
     watched.viewing.stop()
 
@@ -165,13 +182,16 @@ def test_a_motion_plays_and_a_changed_pose_holds_it(watched):
     seen = []
     for watched.now in (0.0, 0.12, 0.25, 0.41):
         picture, wait = viewing.picture()
-        assert picture.is_playing and 0 < wait <= 0.1
+        assert picture.is_playing
+        assert 0 < wait <= 0.1
         seen.append((picture.frame, picture.posed.translation[0]))
     assert seen == [(0, 0.0), (1, 0.5), (2, 1.0), (0, 0.0)]
     watched.now = 0.72
     viewing.turn_joint(0, np.array([0.0, 0.3, 0.0]))  # starts from the frame that was due
     picture, wait = viewing.picture()
-    assert not picture.is_playing and wait is None and picture.frame == 3
+    assert not picture.is_playing
+    assert wait is None
+    assert picture.frame == 3
     np.testing.assert_allclose(picture.posed.pose, [(0, 0.3, 0), (0, 0, 0.9)])
     assert picture.posed.translation[0] == 1.5
     viewing.seek(1)
@@ -189,7 +209,9 @@ def test_a_field_while_playing_is_the_last_one_made(watched):
     watched.viewing.play()
     watched.now = 0.25
     picture = watched.picture()
-    assert picture.frame == 2 and picture.mesh.surface == "field" and picture.shown.number < picture.posed.number
+    assert picture.frame == 2
+    assert picture.mesh.surface == "field"
+    assert picture.shown.number < picture.posed.number
     watched.viewing.pause()
     assert watched.settled().shown.number == picture.posed.number
 
@@ -261,7 +283,8 @@ def test_reset_mirror_and_height(watched):
     assert viewing.posed.translation.tolist() == [1.5, 2.5, 0]
     viewing.reset_pose()
     picture = watched.settled()
-    assert not picture.posed.pose.any() and picture.posed.translation[[0, 2]].tolist() == [0, 0]
+    assert not picture.posed.pose.any()
+    assert picture.posed.translation[[0, 2]].tolist() == [0, 0]
     viewing.reset_pose()  # now that the skin is known: exactly on the floor
     assert watched.settled().mesh.vertices[:, 1].min() == pytest.approx(viewing.floor_y, abs=1e-3)
 

@@ -24,7 +24,8 @@ def test_one_thing_at_a_time_and_nothing_queued(idle):
 
     worker = Worker(work, idle.set)
     assert worker.take() is None
-    assert worker.start(1) and begun.wait(PATIENCE)
+    assert worker.start(1)
+    assert begun.wait(PATIENCE)
     assert not worker.start(2)  # forgotten
     go_on.set()
     assert idle.wait(PATIENCE)
@@ -32,7 +33,8 @@ def test_one_thing_at_a_time_and_nothing_queued(idle):
     assert worker.take() == (1, 2, None)
     assert worker.take() is None
     idle.clear()
-    assert worker.start(4) and idle.wait(PATIENCE)
+    assert worker.start(4)
+    assert idle.wait(PATIENCE)
     assert worker.take() == (4, 8, None)
     worker.stop()
     assert not worker.start(5)

@@ -1,6 +1,7 @@
-/* Plain C interface of the CPU library; numbers are float or double by `bytes_per_number` (4 or 8). Poses are B, queries a pose N,
- * nodes V = D H W, cells (D-1)(H-1)(W-1), all arrays dense and row-major. A search is done in two calls, because the number of
- * roots is only known after it: the first returns a handle and the count, the second writes the roots and frees the handle. */
+/* Plain C interface of the CPU library; numbers are float or double by `bytes_per_number` (4 or 8). Poses are B, queries a pose
+ * N, nodes V = D H W, cells (D-1)(H-1)(W-1), all arrays dense and row-major. A search is done in two calls, because the number
+ * of roots is only known after it: the first returns a handle and the count, the second writes the roots and frees the handle.
+ */
 #pragma once
 
 #include <stdint.h>
@@ -20,31 +21,31 @@ extern "C" {
 enum { SNARF_OK = 0, SNARF_BAD_ARGUMENT = 1, SNARF_OUT_OF_MEMORY = 2 };
 
 typedef struct snarf_field {
-  const void* transforms;  /* blended transforms at the nodes, [B, V, 12] */
-  double lower[3];         /* canonical position of the first node, metres */
-  double size[3];          /* sides of a cell, metres */
-  int32_t nodes[3];        /* W, H, D */
+  const void* transforms; /* blended transforms at the nodes, [B, V, 12] */
+  double lower[3];        /* canonical position of the first node, metres */
+  double size[3];         /* sides of a cell, metres */
+  int32_t nodes[3];       /* W, H, D */
   int32_t bytes_per_number;
 } snarf_field;
 
 typedef struct snarf_queries {
-  const void* points;      /* [B, N, 3], posed, metres; a non-finite point has no root */
-  int64_t poses;           /* B */
-  int64_t count;           /* N */
-  int32_t threads;         /* at most */
+  const void* points; /* [B, N, 3], posed, metres; a non-finite point has no root */
+  int64_t poses;      /* B */
+  int64_t count;      /* N */
+  int32_t threads;    /* at most */
 } snarf_queries;
 
 typedef struct snarf_complete {
-  const uint8_t* active;   /* cells to search, [(D-1)(H-1)(W-1)], or null for all */
-  double tolerance;        /* largest residual of a root, metres */
-  int32_t max_steps;       /* Newton steps from one start */
-  int32_t orientation_preserving;  /* keep only roots with det J > 0 */
+  const uint8_t* active;          /* cells to search, [(D-1)(H-1)(W-1)], or null for all */
+  double tolerance;               /* largest residual of a root, metres */
+  int32_t max_steps;              /* Newton steps from one start */
+  int32_t orientation_preserving; /* keep only roots with det J > 0 */
 } snarf_complete;
 
 typedef struct snarf_broyden {
-  const void* starts;      /* rows of the inverse bone transforms that give a start, [B, I, 12], posed to canonical */
-  int64_t count;           /* I */
-  double tolerance, divergence;  /* metres */
+  const void* starts;           /* rows of the inverse bone transforms that give a start, [B, I, 12], posed to canonical */
+  int64_t count;                /* I */
+  double tolerance, divergence; /* metres */
   int32_t max_steps;
   int32_t exact_jacobian;
   int32_t orientation_preserving;
@@ -52,54 +53,58 @@ typedef struct snarf_broyden {
 
 /* Weights at the nodes and the transforms that they blend (Fast-SNARF Eq. 13). */
 typedef struct snarf_blending {
-  const void* weights;     /* [V, J] */
-  const void* bones;       /* upper three rows, [B, J, 12] */
-  const uint8_t* active;   /* [(D-1)(H-1)(W-1)]: only the corners of these cells are blended, others get zeros; null for all */
-  int64_t poses, count;    /* B, J */
-  int32_t nodes[3];        /* W, H, D */
+  const void* weights;   /* [V, J] */
+  const void* bones;     /* upper three rows, [B, J, 12] */
+  const uint8_t* active; /* [(D-1)(H-1)(W-1)]: only the corners of these cells are blended, others get zeros; null for all */
+  int64_t poses, count;  /* B, J */
+  int32_t nodes[3];      /* W, H, D */
   int32_t bytes_per_number;
-  int32_t threads;         /* at most */
+  int32_t threads; /* at most */
 } snarf_blending;
 
 /* A layer: activation(weights [previous; encoded point; extras] + bias), where it takes only what it says. */
 typedef struct snarf_layer {
-  const float* weights;    /* [outputs, inputs], columns in the order above */
-  const float* bias;       /* [outputs] */
+  const float* weights; /* [outputs, inputs], columns in the order above */
+  const float* bias;    /* [outputs] */
   int32_t outputs;
-  int32_t takes_point;     /* the first layer must */
+  int32_t takes_point; /* the first layer must */
   int32_t takes_extras;
-  int32_t activation;      /* 0: none, 1: ReLU, 2: softplus */
+  int32_t activation; /* 0: none, 1: ReLU, 2: softplus */
 } snarf_layer;
 
 /* A canonical occupancy network (SNARF Eq. 1) in one pose; the last layer has one output. */
 typedef struct snarf_network {
   const snarf_layer* layers;
   int32_t layer_count;
-  const float* frequencies;  /* radians a metre, [K]: the encoded point is x, sin(k x) for each k, cos(k x) for each k */
+  const float* frequencies; /* radians a metre, [K]: the encoded point is x, sin(k x) for each k, cos(k x) for each k */
   int32_t frequency_count;
-  const float* segments;     /* bones, [S, 2, 3], metres */
-  int32_t segment_count;     /* S; 0 for no capsules */
-  float radius, slope;       /* slope * (radius - distance to the nearest bone) is added */
-  float sharpness;           /* of the softplus */
-  int32_t extra_count;       /* E, values of each point's own */
+  const float* segments; /* bones, [S, 2, 3], metres */
+  int32_t segment_count; /* S; 0 for no capsules */
+  float radius, slope;   /* slope * (radius - distance to the nearest bone) is added */
+  float sharpness;       /* of the softplus */
+  int32_t extra_count;   /* E, values of each point's own */
 } snarf_network;
 
 typedef struct snarf_roots snarf_roots;
 
 SNARF_API int snarf_abi_version(void);
-/* Name of the instruction set in use: avx512, avx2 or baseline. SNARF_INSTRUCTION_SET in the environment may ask for a lower one. */
+/* Name of the instruction set in use: avx512, avx2 or baseline. SNARF_INSTRUCTION_SET in the environment may ask for a lower
+ * one. */
 SNARF_API const char* snarf_instruction_set(void);
 
 /* transforms [B, V, 12]. */
 SNARF_API int snarf_blend(const snarf_blending*, void* transforms);
-/* Gradients of a loss by the weights [V, J] and by the bones [B, J, 12] from that by the transforms [B, V, 12]; either result may be
- * null, both are overwritten. */
+/* Gradients of a loss by the weights [V, J] and by the bones [B, J, 12] from that by the transforms [B, V, 12]; either result
+ * may be null, both are overwritten. */
 SNARF_API int snarf_blend_backward(const snarf_blending*, const void* gradient, void* v_weights, void* v_bones);
 
-SNARF_API int snarf_complete_search(const snarf_field*, const snarf_queries*, const snarf_complete*, snarf_roots** roots, int64_t* found);
-SNARF_API int snarf_broyden_search(const snarf_field*, const snarf_queries*, const snarf_broyden*, snarf_roots** roots, int64_t* found);
+SNARF_API int snarf_complete_search(const snarf_field*, const snarf_queries*, const snarf_complete*, snarf_roots** roots,
+                                    int64_t* found);
+SNARF_API int snarf_broyden_search(const snarf_field*, const snarf_queries*, const snarf_broyden*, snarf_roots** roots,
+                                   int64_t* found);
 
-/* canonical [M, 3], query [M] (b N + n, ascending), jacobian_inverse [M, 3, 3]. Frees the handle; null pointers only free it. */
+/* canonical [M, 3], query [M] (b N + n, ascending), jacobian_inverse [M, 3, 3]. Frees the handle; null pointers only free it.
+ */
 SNARF_API int snarf_take_roots(snarf_roots* roots, void* canonical, int64_t* query, void* jacobian_inverse);
 
 /* Gradients of a loss by the queries [B, N, 3] and by the nodes' transforms [B, V, 12], from that by the roots, [M, 3]. Either
@@ -109,7 +114,8 @@ SNARF_API int snarf_implicit_backward(const snarf_field*, const snarf_queries*, 
                                       void* v_transforms);
 
 /* Logits [N] at points [N, 3], metres, with extras [N, E]; always float. A point's result does not depend on the others. */
-SNARF_API int snarf_evaluate(const snarf_network*, const float* points, const float* extras, int64_t count, int32_t threads, float* logits);
+SNARF_API int snarf_evaluate(const snarf_network*, const float* points, const float* extras, int64_t count, int32_t threads,
+                             float* logits);
 
 #ifdef __cplusplus
 }

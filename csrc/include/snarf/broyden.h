@@ -1,8 +1,8 @@
 // Broyden's method on the whole grid from one start: the papers' search (SNARF Eq. 6-8, Fast-SNARF Eq. 7-9).
 //
-// Where we differ from the released kernel: the start Jacobian is the exact one of d, not the transpose of the blended 3x3; a step
-// that leaves the grid is clamped to its border, where outside the transform would be zero; the inverse Jacobian is the exact
-// one at the root, on request the iteration's approximation after its last update.
+// Where we differ from the released kernel: the start Jacobian is the exact one of d, not the transpose of the blended 3x3; a
+// step that leaves the grid is clamped to its border, where outside the transform would be zero; the inverse Jacobian is the
+// exact one at the root, on request the iteration's approximation after its last update.
 #pragma once
 
 #include "grid.h"
@@ -10,7 +10,8 @@
 namespace snarf {
 namespace SNARF_ISA {
 
-template <class S> struct Broyden {
+template <class S>
+struct Broyden {
   S tolerance;   // largest residual of a root, metres
   S divergence;  // residual at which a start is given up, metres
   int max_steps;
@@ -49,7 +50,8 @@ SNARF_HD void blend_at(const S* transforms, const Grid<S>& grid, const S* x, S* 
 }
 
 // d(x) - target, metres.
-template <class S> SNARF_HD void residual_of(const S* blended, const S* x, const S* target, S* residual) {
+template <class S>
+SNARF_HD void residual_of(const S* blended, const S* x, const S* target, S* residual) {
   for (int i = 0; i < 3; ++i) {
     const S* row = blended + 4 * i;
     residual[i] = row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + row[3] - target[i];
@@ -63,7 +65,8 @@ SNARF_HD bool inverse_jacobian(const Grid<S>& grid, const S* x, const S* blended
   for (int i = 0; i < 3; ++i)
     for (int axis = 0; axis < 3; ++axis) {
       const S* row = derivatives + 12 * axis + 4 * i;
-      jacobian[3 * i + axis] = blended[4 * i + axis] + (row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + row[3]) / grid.size[axis];
+      jacobian[3 * i + axis] =
+          blended[4 * i + axis] + (row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + row[3]) / grid.size[axis];
     }
   S determinant = adjugate(jacobian, inverse);
   S reciprocal = determinant != 0 ? S(1) / determinant : S(0);

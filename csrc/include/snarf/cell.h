@@ -1,16 +1,16 @@
 // One grid cell as a polynomial: where it goes, how curved it is, and its eight parts.
 //
-// DESIGN. Inside a cell the blended transform T is trilinear (Fast-SNARF Sec. 4.1) and d(x) = T(x) [x; 1] (SNARF Eq. 4), so each
-// component of d is a polynomial in the cell's coordinates s = (s0, s1, s2), which run from -1/2 to 1/2: the eight trilinear
-// monomials and, for each axis a, s_a^2 times the four bilinear monomials of the other two; twenty in all. Halving the cell
-// stays inside this space. With the coordinates centred, every monomial other than 1 is at most (1/2)^degree, which bounds
-// everything by sums of absolute coefficients:
+// DESIGN. Inside a cell the blended transform T is trilinear (Fast-SNARF Sec. 4.1) and d(x) = T(x) [x; 1] (SNARF Eq. 4), so
+// each component of d is a polynomial in the cell's coordinates s = (s0, s1, s2), which run from -1/2 to 1/2: the eight
+// trilinear monomials and, for each axis a, s_a^2 times the four bilinear monomials of the other two; twenty in all. Halving
+// the cell stays inside this space. With the coordinates centred, every monomial other than 1 is at most (1/2)^degree, which
+// bounds everything by sums of absolute coefficients:
 //   posed box           |d - d(0)|_i       <= sum_m |c_mi| (1/2)^deg(m)
 //   preconditioned      |J0^-1 (d - d(0)) - s|_i <= sum_{m nonlinear} |J0^-1 c_m|_i (1/2)^deg(m)
 //   its derivative      row sums           <= sum_{m nonlinear} |J0^-1 c_m|_i deg(m) (1/2)^(deg(m)-1)  =: curvature
-// Curvature below one proves that d is injective in the cell: at most one root. Below about 3/4 it also proves that Newton's method
-// from the affine guess finds it; up to 0.9 (kTame) no miss was ever measured (tests/deformer/test_native_search.py).
-// A cell beyond that (next to a fold, where det J changes sign, it always is) is cut into eight, again and again.
+// Curvature below one proves that d is injective in the cell: at most one root. Below about 3/4 it also proves that Newton's
+// method from the affine guess finds it; up to 0.9 (kTame) no miss was ever measured (tests/deformer/test_native_search.py). A
+// cell beyond that (next to a fold, where det J changes sign, it always is) is cut into eight, again and again.
 #pragma once
 
 #include "platform.h"
@@ -22,43 +22,45 @@ namespace SNARF_ISA {
 // 1, the first, the second, and the product of the other two axes (in ascending order).
 constexpr int kMonomials = 20;
 
-// Fraction of a cell beyond its faces within which a root still belongs to it: rounding may put a root on a face outside of both
-// neighbours. Both then report it, and one is dropped.
-template <class T> constexpr T face_tolerance() { return sizeof(T) == 4 ? T(1e-4) : T(1e-9); }
+// Fraction of a cell beyond its faces within which a root still belongs to it: rounding may put a root on a face outside of
+// both neighbours. Both then report it, and one is dropped.
+template <class T>
+constexpr T face_tolerance() {
+  return sizeof(T) == 4 ? T(1e-4) : T(1e-9);
+}
 
-template <class V> struct Cell {
+template <class V>
+struct Cell {
   V c[3 * kMonomials];  // [component][monomial]; c[20 i] is the posed centre, metres
 };
 
-template <class V> struct CellBounds {
-  V box[3];        // half extents of the posed box around the centre, metres
-  V inverse[9];    // J0^-1, posed metres to cell coordinates; zero where J0 is singular
-  V reach[3];      // a root in the cell has |J0^-1 (x' - centre)|_i <= reach_i
-  V curvature;     // below one: at most one root
+template <class V>
+struct CellBounds {
+  V box[3];      // half extents of the posed box around the centre, metres
+  V inverse[9];  // J0^-1, posed metres to cell coordinates; zero where J0 is singular
+  V reach[3];    // a root in the cell has |J0^-1 (x' - centre)|_i <= reach_i
+  V curvature;   // below one: at most one root
 };
 
-SNARF_HD int monomial_degree(int m) {
-  return m < 8 ? (m & 1) + (m >> 1 & 1) + (m >> 2 & 1) : 2 + ((m & 3) + 1) / 2;
-}
+SNARF_HD int monomial_degree(int m) { return m < 8 ? (m & 1) + (m >> 1 & 1) + (m >> 2 & 1) : 2 + ((m & 3) + 1) / 2; }
 SNARF_HD int square_monomial(int axis, int others) { return 8 + 4 * axis + others; }
 
 // Coefficients from the corner transforms.
 //   corner[k * 12 + r]: blended 3x4 transforms (row-major) at the corners, k = x + 2 y + 4 z; overwritten
 //   centre[3], size[3]: canonical centre and sides of the cell, metres
-template <class V, class S> SNARF_HD void cell_from_corners(V* corner, const V* centre, const S* size, Cell<V>& cell) {
+template <class V, class S>
+SNARF_HD void cell_from_corners(V* corner, const V* centre, const S* size, Cell<V>& cell) {
   // Trilinear coefficients of T in centred coordinates, in place: index k becomes the monomial with the bits of k.
-  for (int channel = 0; channel < 12; ++channel)
-    SNARF_UNROLL
-    for (int bit = 1; bit < 8; bit <<= 1)
-      SNARF_UNROLL
-      for (int k = 0; k < 8; ++k)
-        if (!(k & bit)) {
-          V& low = corner[k * 12 + channel];
-          V& high = corner[(k | bit) * 12 + channel];
-          V difference = high - low;
-          low = (low + high) * S(0.5);
-          high = difference;
-        }
+  for (int channel = 0; channel < 12; ++channel) SNARF_UNROLL
+  for (int bit = 1; bit < 8; bit <<= 1) SNARF_UNROLL
+  for (int k = 0; k < 8; ++k)
+    if (!(k & bit)) {
+      V& low = corner[k * 12 + channel];
+      V& high = corner[(k | bit) * 12 + channel];
+      V difference = high - low;
+      low = (low + high) * S(0.5);
+      high = difference;
+    }
   for (int i = 0; i < 3; ++i) {
     V* c = cell.c + kMonomials * i;
     const V* row = corner + 4 * i;
@@ -82,9 +84,10 @@ template <class V, class S> SNARF_HD void cell_from_corners(V* corner, const V* 
   }
 }
 
-// Half extents [3] of the posed box, rigorous up to rounding, for which slack is added. `wide`: coordinate up to which a root counts
-// as in the cell.
-template <class V, class S> SNARF_HD void bound_box(const Cell<V>& cell, V* box, S wide = S(0.5) + face_tolerance<S>()) {
+// Half extents [3] of the posed box, rigorous up to rounding, for which slack is added. `wide`: coordinate up to which a root
+// counts as in the cell.
+template <class V, class S>
+SNARF_HD void bound_box(const Cell<V>& cell, V* box, S wide = S(0.5) + face_tolerance<S>()) {
   constexpr S epsilon = sizeof(S) == 4 ? S(1e-6) : S(1e-14);
   for (int i = 0; i < 3; ++i) {
     const V* c = cell.c + kMonomials * i;
@@ -133,7 +136,8 @@ SNARF_HD void bound_cell(const Cell<V>& cell, CellBounds<V>& out, S wide = S(0.5
     }
     V reach = ((sums[4] * wide + sums[3]) * wide + sums[2]) * (wide * wide) + wide;
     V slope = sums[2] + sums[3] * S(0.75) + sums[4] * S(0.5);
-    V rounding = absolute(row[0] * cell.c[0]) + absolute(row[1] * cell.c[kMonomials]) + absolute(row[2] * cell.c[2 * kMonomials]);
+    V rounding =
+        absolute(row[0] * cell.c[0]) + absolute(row[1] * cell.c[kMonomials]) + absolute(row[2] * cell.c[2 * kMonomials]);
     out.reach[i] = select(regular, reach + (rounding + reach) * epsilon, zero + S(1e30));
     out.curvature = larger(out.curvature, slope);
   }
@@ -141,7 +145,8 @@ SNARF_HD void bound_cell(const Cell<V>& cell, CellBounds<V>& out, S wide = S(0.5
 }
 
 // Whether a query at `offset` [3] from the posed centre may have a root in the cell.
-template <class V> SNARF_HD auto may_hold(const V* box, const V* inverse, const V* reach, const V* offset) {
+template <class V>
+SNARF_HD auto may_hold(const V* box, const V* inverse, const V* reach, const V* offset) {
   auto inside = (absolute(offset[0]) <= box[0]) & (absolute(offset[1]) <= box[1]) & (absolute(offset[2]) <= box[2]);
   for (int i = 0; i < 3; ++i) {
     V y = inverse[3 * i] * offset[0] + inverse[3 * i + 1] * offset[1] + inverse[3 * i + 2] * offset[2];
@@ -151,7 +156,8 @@ template <class V> SNARF_HD auto may_hold(const V* box, const V* inverse, const 
 }
 
 // The part of a cell around s = shift (each +-1/4) with half its sides, in its own centred coordinates: s = shift + s' / 2.
-template <class V, class S> SNARF_HD void halve_cell(const Cell<V>& cell, const V* shift, Cell<V>& part) {
+template <class V, class S>
+SNARF_HD void halve_cell(const Cell<V>& cell, const V* shift, Cell<V>& part) {
   for (int i = 0; i < 3; ++i) {
     V* c = part.c + kMonomials * i;
     for (int m = 0; m < kMonomials; ++m) c[m] = cell.c[kMonomials * i + m];
@@ -190,7 +196,8 @@ template <class V, class S> SNARF_HD void halve_cell(const Cell<V>& cell, const 
 }
 
 // One component of d - d(0) and its derivatives by the cell coordinates. c: [20] as in Cell, of scalars or lanes.
-template <class V, class C> SNARF_HD void evaluate_component(const C* c, V s, V t, V r, V& value, V* gradient) {
+template <class V, class C>
+SNARF_HD void evaluate_component(const C* c, V s, V t, V r, V& value, V* gradient) {
   V tt = t + t, rr = r + r, ss = s + s, r2 = r * r;
   // Collected by powers of s: d = A + s B + s^2 Q, with A, B quadratic and Q bilinear in t and r.
   V ap = c[12] + c[14] * r, aq = c[2] + c[6] * r + c[18] * r2;

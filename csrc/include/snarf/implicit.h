@@ -10,12 +10,14 @@ namespace snarf {
 namespace SNARF_ISA {
 
 // v = J^-T g. inverse: J^-1 row-major [9]; g, v: [3].
-template <class S> SNARF_HD void pull_back(const S* inverse, const S* g, S* v) {
+template <class S>
+SNARF_HD void pull_back(const S* inverse, const S* g, S* v) {
   for (int i = 0; i < 3; ++i) v[i] = inverse[i] * g[0] + inverse[3 + i] * g[1] + inverse[6 + i] * g[2];
 }
 
 // -v (outer) [x; 1], row-major [12].
-template <class S> SNARF_HD void transform_gradient(const S* v, const S* x, S* out) {
+template <class S>
+SNARF_HD void transform_gradient(const S* v, const S* x, S* out) {
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) out[4 * i + j] = -v[i] * x[j];
     out[4 * i + 3] = -v[i];

@@ -6,19 +6,29 @@
 namespace snarf {
 namespace SNARF_ISA {
 
-template <class S> struct Solver {
-  S tolerance;    // largest residual of a root, metres
+template <class S>
+struct Solver {
+  S tolerance;  // largest residual of a root, metres
   int max_steps;
 };
 
 // A step this short, in cells, is the last: it leaves the Jacobian as it is to three digits (float) and, the method converging
 // quadratically, the root exact. After max_steps a root is taken as it is, with the Jacobian where it was last evaluated.
-template <class S> constexpr S last_step() { return sizeof(S) == 4 ? S(2e-4) : S(1e-7); }
+template <class S>
+constexpr S last_step() {
+  return sizeof(S) == 4 ? S(2e-4) : S(1e-7);
+}
 // Beside a fold the step of a point whose residual is below the tolerance may be long; up to here it is taken.
-template <class S> constexpr S trusted_step() { return S(1e-2); }
-// Coordinates beyond the cell at which a start is given up, in cells. A step that ends farther outside than it was long will not
-// come back either, since steps grow shorter towards a root.
-template <class S> constexpr S stray() { return S(0.75); }
+template <class S>
+constexpr S trusted_step() {
+  return S(1e-2);
+}
+// Coordinates beyond the cell at which a start is given up, in cells. A step that ends farther outside than it was long will
+// not come back either, since steps grow shorter towards a root.
+template <class S>
+constexpr S stray() {
+  return S(0.75);
+}
 
 // Solves d(s) - d(0) = offset from the start s[3] for the lanes in `going`.
 //   c: the cell's coefficients [3][20];  reach: coordinate up to which a root counts as inside

@@ -1,11 +1,12 @@
-// What the shared mathematics needs of the compiler: host and device markers, and the few operations that a scalar and a pack of
-// SIMD lanes have in common. Included by the CPU kernels (GCC, Clang, MSVC) and by the CUDA kernels (NVRTC): no standard headers.
+// What the shared mathematics needs of the compiler: host and device markers, and the few operations that a scalar and a pack
+// of SIMD lanes have in common. Included by the CPU kernels (GCC, Clang, MSVC) and by the CUDA kernels (NVRTC): no standard
+// headers.
 //
 // Everything is templated on V, the type of a number: float or double, or a pack of them (csrc/cpu/lanes.h). A comparison of V
 // gives a Mask: bool for a scalar.
 //
-// SNARF_ISA names an inner namespace. The CPU kernels are compiled once per instruction set, and two instantiations of one template
-// must not be merged by the linker: the survivor could use instructions that the machine lacks.
+// SNARF_ISA names an inner namespace. The CPU kernels are compiled once per instruction set, and two instantiations of one
+// template must not be merged by the linker: the survivor could use instructions that the machine lacks.
 #pragma once
 
 #ifndef SNARF_ISA
@@ -43,10 +44,14 @@ SNARF_HD double smaller(double a, double b) { return a < b ? a : b; }
 SNARF_HD bool any(bool mask) { return mask; }
 
 // The largest absolute value of three.
-template <class V> SNARF_HD V longest_of(V a, V b, V c) { return larger(absolute(a), larger(absolute(b), absolute(c))); }
+template <class V>
+SNARF_HD V longest_of(V a, V b, V c) {
+  return larger(absolute(a), larger(absolute(b), absolute(c)));
+}
 
 // Adjugate (row-major [9]) of the row-major 3x3 matrix m; returns the determinant. Inverse = adjugate / determinant.
-template <class V> SNARF_HD V adjugate(const V* m, V* adj) {
+template <class V>
+SNARF_HD V adjugate(const V* m, V* adj) {
   adj[0] = m[4] * m[8] - m[5] * m[7];
   adj[1] = m[2] * m[7] - m[1] * m[8];
   adj[2] = m[1] * m[5] - m[2] * m[4];

@@ -31,7 +31,7 @@ def main():
         "shapedirs": components[:, :, :2],
         "posedirs": (np.arange(6 * 3 * 9).reshape(6, 3, 9) / 1000.0).astype(">f8"),
         "bs_type": "lrotmin",
-        "pose_training_info": OrderedDict([("scans", np.float64(3)), ("ids", set([1, 2]))]),
+        "pose_training_info": OrderedDict([("scans", np.float64(3)), ("ids", {1, 2})]),
     }
     for protocol in (0, 1, 2):
         with open(os.path.join(folder, "python2_body_" + str(protocol) + ".pkl"), "wb") as file:

@@ -71,11 +71,11 @@ inline int atomicSub(int* at, int value) { return __atomic_fetch_sub(at, value, 
 inline int atomicExch(int* at, int value) { return __atomic_exchange_n(at, value, __ATOMIC_RELAXED); }
 inline unsigned atomicMax(unsigned* at, unsigned value) {
   unsigned old = __atomic_load_n(at, __ATOMIC_RELAXED);
-  while (old < value && !__atomic_compare_exchange_n(at, &old, value, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {
-  }
+  while (old < value && !__atomic_compare_exchange_n(at, &old, value, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
   return old;
 }
-template <class S> S atomicAdd(S* at, S value) {
+template <class S>
+S atomicAdd(S* at, S value) {
   S old, sum;
   __atomic_load(at, &old, __ATOMIC_RELAXED);
   do sum = old + value;

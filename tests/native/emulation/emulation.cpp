@@ -10,7 +10,8 @@ namespace {
 
 using namespace snarf::device;
 
-template <class Arguments> struct Entry {
+template <class Arguments>
+struct Entry {
   const char* name;
   void (*kernel)(Arguments);
 };

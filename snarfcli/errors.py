@@ -1,21 +1,35 @@
-"""The one error type for what a user can cause, and help with misspelt names."""
+"""The error type for user errors, and helpers for its messages."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
 
-__all__ = ["UserError", "nearest"]
+__all__ = ["UserError", "nearest", "one_line"]
 
 
 class UserError(ValueError):
-    """Something a user can mend: one line that says what was wanted, what came and what to do next.
+    """An error that the user can fix. The message is one line: what was wanted, what was given, and what to do next.
 
-    The command line prints it without a stack trace and ends with exit code 2.
+    The command line prints it without a stack trace and exits with code 2.
     """
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """Return `"; did you mean 'x'?"` for the valid name closest to `name`, or an empty string where none is close."""
+    """Return `"; did you mean 'x'?"` with the valid name closest to `name`, or an empty string if none is similar."""
     match = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
-    return f"; did you mean {match[0][:60]!r}?" if match else ""  # names from files may hold anything
+    return f"; did you mean {match[0][:60]!r}?" if match else ""  # names read from files can contain any character
+
+
+def one_line(reason: str | BaseException, longest: int | None = None) -> str:
+    """Return a text, or the message of an exception, as one printable line.
+
+    Line breaks and control characters become spaces, and repeated spaces one.
+
+    Args:
+        reason: the text or exception; an exception without a message gives the name of its type.
+        longest: maximum number of characters; None for no limit. Needed for messages that quote untrusted files.
+    """
+    text = reason if isinstance(reason, str) else str(reason) or type(reason).__name__
+    line = " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
+    return line[:longest]

@@ -17,7 +17,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, one_line
 
 __all__ = ["MAX_ARRAY_BYTES", "atomic_path", "file_digest", "read_json", "read_npy", "read_npz", "write_json", "write_tensors"]
 
@@ -97,7 +97,7 @@ def read_json(path: str | Path, what: str = "file") -> Any:
     try:
         return json.loads(path.read_text())
     except ValueError as error:  # bad UTF-8, bad JSON, a number of over 4300 digits
-        raise UserError(f"{what} {path} is not valid JSON ({_one_line(str(error))}); make it again") from None
+        raise UserError(f"{what} {path} is not valid JSON ({one_line(error, 200)}); make it again") from None
     except RecursionError:
         raise UserError(f"{what} {path} is not valid JSON (nested too deeply); make it again") from None
 
@@ -137,8 +137,8 @@ def read_npz(
     except UserError:
         raise
     except Exception as error:  # zipfile lets many kinds through; tests/fuzz_targets.py found over ten
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or type(error).__name__
-        raise UserError(f"{what} {path} is damaged ({_one_line(reason)}); copy or download it again") from None
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise UserError(f"{what} {path} is damaged ({one_line(reason, 200)}); copy or download it again") from None
 
 
 def read_npy(path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY_BYTES) -> np.ndarray:
@@ -246,8 +246,3 @@ def _read_array(stream: IO[bytes], size: int, subject: str) -> np.ndarray | None
         return flat.reshape(lengths, order="F" if order == "True" else "C")
     except (ValueError, TypeError):  # too many dimensions, say
         raise damaged from None
-
-
-def _one_line(reason: str) -> str:
-    """Return the start of another library's message, without line ends, controls and whatever else cannot be printed."""
-    return "".join(letter if letter.isprintable() else " " for letter in reason)[:200]

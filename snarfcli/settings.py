@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from snarfcli.errors import UserError, nearest
+from snarfcli.errors import UserError, nearest, one_line
 
 __all__ = [
     "check_overrides",
@@ -130,8 +130,7 @@ def check_overrides(overrides: Sequence[str], schema: type, command: str = "") -
         try:
             override = parser.parse_override(text)
         except HydraException as error:
-            reason = " ".join(str(error).split())
-            raise UserError(f"cannot read {text!r} ({reason}); quote special characters: NAME='\"VALUE\"'") from None
+            raise UserError(f"cannot read {text!r} ({one_line(error)}); quote special characters: NAME='\"VALUE\"'") from None
         key = override.key_or_group
         if key.split(".")[0] == "hydra" or key.startswith("hydra/"):
             continue

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import re
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, one_line
 
 __all__ = ["user_message"]
 
@@ -18,7 +18,7 @@ def user_message(error: BaseException) -> str | None:
     chain = _chain(error)
     for link in chain:
         if isinstance(link, UserError):
-            return _one_line(link)
+            return one_line(link)
     for link in chain:
         if isinstance(link, OSError) and not isinstance(link, (ConnectionError, ChildProcessError)):
             return _file_message(link)
@@ -37,10 +37,6 @@ def _chain(error: BaseException) -> list[BaseException]:
     return links
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
-
-
 def _file_message(error: OSError) -> str:
     """Return what went wrong with a file and what to do."""
     name = error.filename2 or error.filename or "a file"
@@ -55,12 +51,12 @@ def _file_message(error: OSError) -> str:
         errno.EEXIST: "is a file, not a folder; choose another folder",
         errno.ENOENT: "is not there and cannot be made; choose another folder or file",
     }
-    return f"{name}: {advice.get(error.errno or 0, error.strerror or _one_line(error))}"
+    return f"{name}: {advice.get(error.errno or 0, error.strerror or one_line(error))}"
 
 
 def _config_message(chain: list[BaseException]) -> str:
     """Return one line for a setting whose value does not fit."""
-    text = " ".join(_one_line(link) for link in chain)
+    text = " ".join(one_line(link) for link in chain)
     unfit = re.search(r"Value '([^']*)'.*? could not be converted to (\w+)", text)
     key = re.search(r"full_key: ([\w.]+)", text)
     if unfit and key:

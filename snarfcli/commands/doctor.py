@@ -16,6 +16,7 @@ from omegaconf import MISSING
 
 import snarfcli
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.errors import one_line
 
 __all__ = ["DoctorConfig", "Finding", "run"]
 
@@ -127,11 +128,11 @@ def _survey(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     try:
         yield from look()
     except Exception as error:  # a broken installation is what this command is for
-        yield Finding("error", _one_line(error), is_fallback=True)
+        yield Finding("error", _describe_error(error), is_fallback=True)
 
 
-def _one_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+def _describe_error(error: Exception) -> str:
+    return f"{type(error).__name__}: {one_line(error)}"
 
 
 def _versions() -> Iterator[Finding]:
@@ -152,7 +153,7 @@ def _package(name: str, package: str, module: str | None = None) -> Finding:
     except PackageNotFoundError:
         return Finding(name, f'not installed; run "pip install {package}"', is_fallback=True)
     except Exception as error:
-        return Finding(name, f"{package} {installed} cannot be imported: {_one_line(error)}", is_fallback=True)
+        return Finding(name, f"{package} {installed} cannot be imported: {_describe_error(error)}", is_fallback=True)
     return Finding(name, f"{package} {installed}" if name != package else installed)
 
 
@@ -209,7 +210,7 @@ def _ffmpeg() -> Finding:
 
         return Finding("ffmpeg", f"{imageio_ffmpeg.get_ffmpeg_version()}, {imageio_ffmpeg.get_ffmpeg_exe()}")
     except Exception as error:
-        text = f'none ({_one_line(error)}); videos cannot be written; run "pip install imageio-ffmpeg"'
+        text = f'none ({_describe_error(error)}); videos cannot be written; run "pip install imageio-ffmpeg"'
         return Finding("ffmpeg", text, is_fallback=True)
 
 

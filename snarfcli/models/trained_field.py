@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Hashable
 from dataclasses import asdict
 from pathlib import Path
@@ -137,6 +138,12 @@ class TrainedField:
         self.model.freeze()
         self._derived.clear()
         return self
+
+    def with_model(self, model: System) -> Self:
+        """Return a copy that answers from another model; its facts and what is derived from the model are separate."""
+        other = copy.copy(self)
+        other.model, other.facts, other._derived = model, copy.deepcopy(self.facts), {}
+        return other
 
     @property
     def device(self) -> torch.device:

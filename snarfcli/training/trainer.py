@@ -163,8 +163,7 @@ class Trainer:
 
     def averaged_avatar(self) -> TrainedField:
         """Return a copy of the avatar with the averaged weights, ready to use."""
-        avatar = copy.copy(self.avatar)
-        avatar.model = copy.deepcopy(self.model)
+        avatar = self.avatar.with_model(copy.deepcopy(self.model))
         with torch.no_grad():
             trained = [p for p in avatar.model.parameters() if p.requires_grad]
             for parameter, average in zip(trained, self.average, strict=True):

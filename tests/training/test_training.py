@@ -166,6 +166,16 @@ def test_unposing_by_the_nearest_bone_straightens_the_capsule(store):
     assert (unposed - canonical).norm(dim=1).median() < 0.01
 
 
+def test_averaged_avatar_shares_neither_surfaces_nor_facts_with_the_raw_one(store):
+    trainer = trainer_for(store)
+    raw = trainer.avatar.derived("surface", lambda: "of the raw weights")
+    averaged = trainer.averaged_avatar()
+    assert averaged.derived("surface", lambda: "of the averaged weights") == "of the averaged weights"
+    assert trainer.avatar.derived("surface", lambda: "computed again") is raw
+    averaged.facts["steps"] = 1
+    assert "steps" not in trainer.avatar.facts
+
+
 def test_avatar_file_holds_all_that_is_needed(store, tmp_path):
     trainer = trainer_for(store, steps=3)
     trainer.advance()

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.meshing.mesh import Mesh
-from snarfcli.meshing.skinned import skin_vertices
+from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.motions import Motion
 
 __all__ = [
@@ -140,7 +140,7 @@ def on_ground(mesh: Mesh, skeleton: Skeleton, clip: Clip) -> tuple[Clip, float]:
         clip: what is moved, as a whole.
     """
     up = -lowest_point(mesh, skeleton, clip)
-    motion = replace(clip.motion, translation=(*clip.motion.translation, 0.0, up, 0.0))
+    motion = replace(clip.motion, translation=np.add(clip.motion.translation, (0.0, up, 0.0)))
     transforms: NDArray | None = clip.bone_transforms
     if transforms is not None:
         transforms = np.array(transforms)

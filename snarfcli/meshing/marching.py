@@ -57,7 +57,7 @@ def march(values: np.ndarray) -> Crossings:
         crop = slab[tuple(slice(nodes[0], nodes[-1] + 2) for nodes in box)]
         signs = np.where(crop, np.float32(1), np.float32(-1))
         middles, faces, _, _ = marching_cubes(signs, 0.0, method="lorensen", gradient_direction="ascent")
-        twice = np.rint(middles * 2).astype(np.int64) + 2 * ((*offset, begin, 0, 0))
+        twice = np.rint(middles * 2).astype(np.int64) + 2 * np.add(offset, (begin, 0, 0))
         keys_parts.append((twice[:, 0] * doubled[1] + twice[:, 1]) * doubled[2] + twice[:, 2])
         faces_parts.append(faces.astype(np.int64) + count)
         count += len(twice)

@@ -223,7 +223,7 @@ class Viewing:
     def _stand(self) -> None:
         """Put the body onto the floor by its height."""
         low = self._made.lowest(self._posed.transforms)
-        translation = (*self._posed.translation, 0.0, self.floor_y - low, 0.0)
+        translation = np.add(self._posed.translation, (0.0, self.floor_y - low, 0.0))
         self._take(self._posed.pose, translation)
 
     def _find_floor(self) -> None:

@@ -177,7 +177,7 @@ def test_two_skins_of_the_same_joints_are_joined(tmp_path):
     first[1, 2, 3] = -50
     root["skins"].append({"joints": [3, 1], "inverseBindMatrices": builder.array(first @ bind)})
     attributes = {
-        "POSITION": builder.array([*_BOX.vertices, 1, 0.5, 0]),
+        "POSITION": builder.array(np.add(_BOX.vertices, [1, 0.5, 0])),
         "JOINTS_0": builder.array([[1, 0, 0, 0]] * 8, "uint16"),
         "WEIGHTS_0": builder.array([[1, 0, 0, 0]] * 8),
     }

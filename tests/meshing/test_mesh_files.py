@@ -15,7 +15,7 @@ def ball(colors: bool, normals: bool) -> Mesh:
     solid = trimesh.creation.icosphere(subdivisions=2, radius=0.7)
     rng = np.random.default_rng(0)
     mesh = Mesh(
-        [*solid.vertices, 0.1, -0.2, 3.0],
+        np.add(solid.vertices, [0.1, -0.2, 3.0]),
         solid.faces,
         colors=rng.integers(0, 256, solid.vertices.shape) if colors else None,
     )

@@ -1,1 +1,1 @@
-"""Foreign files, read into plain structures without executing anything in them."""
+"""Readers for the files of other programs: they return plain structures and execute nothing that a file contains."""

@@ -1,4 +1,6 @@
-"""Triangles of PLY files, text or binary, from their bytes; polygons are cut into fans.
+"""Parse the triangles of PLY files, text or binary, from their bytes; polygons are cut into fans.
+
+`plain_meshes.py` says why trimesh does not read these files.
 
 Source: Greg Turk, The PLY Polygon File Format, 1994.
 """
@@ -30,9 +32,9 @@ _INDICES = ("vertex_indices", "vertex_index")
 class _Property:
     name: str
     code: str
-    """Of `struct`."""
+    """Type of the values, as a format character of `struct`."""
     count_code: str
-    """Of a list's length; empty if it is no list."""
+    """Type of the length of a list, as a format character of `struct`; empty for a single value."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,10 @@ class _Element:
 
 
 def parse_ply(content: bytes) -> Surface:
-    """Read the elements `vertex` (x, y, z) and `face` (vertex_indices or vertex_index) of a PLY file; others are skipped.
+    """Parse the elements `vertex` (x, y, z) and `face` (vertex_indices or vertex_index) of a PLY file; others are skipped.
 
     Raises:
-        ValueError: with a short reason. Memory is taken in proportion to the bytes given, whatever they declare.
+        ValueError: the file is damaged; the message is a short reason.
     """
     order, elements, position = _read_header(content)
     vertices: NDArray[np.float64] = np.zeros((0, 3))
@@ -62,7 +64,7 @@ def parse_ply(content: bytes) -> Surface:
             continue
         least = sum(struct.calcsize("=" + (p.count_code or p.code)) if order else 1 for p in element.properties)
         if element.count * least > (len(content) if order else len(words)) - position:
-            raise ValueError(f"it promises {element.count} of {element.name} and ends before")
+            raise ValueError(f"wanted {element.count} of {element.name}, but the file ends before")
         wanted = _column(element) if element.name in ("vertex", "face") else None
         if not element.has_lists:
             position, table = _read_table(content, words, order, element, position, wanted)
@@ -93,34 +95,34 @@ def _read_header(content: bytes) -> tuple[str, list[_Element], int]:
             elements[-1].properties.append(_Property(words[2], _TYPES[words[1]], ""))
         elif words[:2] == ["property", "list"] and elements and len(words) == 5 and {words[2], words[3]} <= _TYPES.keys():
             if _TYPES[words[2]] in "fd":
-                raise ValueError("the length of a list is no whole number")
+                raise ValueError("the length of a list is not an integer")
             elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
         else:
             raise ValueError(f"its header has a line that is not understood: {line[:60]!a}")
     if order is None:
-        raise ValueError("its header names no format")
+        raise ValueError("its header has no format line")
     if len({element.name for element in elements}) < len(elements):
         raise ValueError("its header names an element twice")
     return order, elements, start
 
 
 def _column(element: _Element) -> list[int]:
-    """Return which properties of `vertex` or `face` are read."""
+    """Return the indices of the properties of `vertex` or `face` that are read."""
     names = [p.name for p in element.properties]
     if element.name == "vertex":
         if element.has_lists or not all(names.count(axis) == 1 for axis in "xyz"):
-            raise ValueError("its vertices do not have x, y and z once each, or have lists")
+            raise ValueError("its vertices: wanted x, y and z once each and no lists")
         return [names.index(axis) for axis in "xyz"]
     found = [i for i, p in enumerate(element.properties) if p.name in _INDICES and p.count_code and p.code not in "fd"]
     if len(found) != 1:
-        raise ValueError(f"its faces do not have one list {_INDICES[0]} of whole numbers")
+        raise ValueError(f"its faces do not have one list {_INDICES[0]} of integers")
     return found
 
 
 def _read_table(
     content: bytes, words: list[bytes], order: str, element: _Element, position: int, wanted: list[int] | None
 ) -> tuple[int, NDArray[np.float64]]:
-    """Return where an element without lists ends, and its wanted columns [count, len(wanted)]."""
+    """Return the end position of an element without lists, and its wanted columns [count, len(wanted)]."""
     count, width = element.count, len(element.properties)
     columns = []
     if order:
@@ -138,13 +140,13 @@ def _read_text_lists(words: list[bytes], element: _Element, position: int, wante
     for _ in range(element.count):
         for number, column in enumerate(element.properties):
             if position >= len(words):
-                raise ValueError(f"it promises {element.count} of {element.name} and ends before")
+                raise ValueError(f"wanted {element.count} of {element.name}, but the file ends before")
             length = 1
             if column.count_code:
                 length = int(words[position])
                 position += 1
                 if not 0 <= length <= len(words) - position:
-                    raise ValueError(f"a list of {element.name} has {length} entries and ends before")
+                    raise ValueError(f"a list of {element.name} has {length} entries, but the file ends before")
                 if wanted and number in wanted:
                     add_fan(corners, [int(word) for word in words[position : position + length]])
             position += length
@@ -155,7 +157,7 @@ def _read_binary_lists(
     content: bytes, order: str, element: _Element, position: int, wanted: list[int] | None, corners: array
 ) -> int:
     if element.count > MAX_FACES:
-        raise ValueError(f"it has {element.count} of {element.name}, more than {MAX_FACES}")
+        raise ValueError(f"wanted at most {MAX_FACES} of {element.name}, got {element.count}")
     end = _read_equal_lists(content, order, element, position, wanted, corners)
     if end is not None:
         return end
@@ -166,11 +168,11 @@ def _read_binary_lists(
             length = 1
             if head:
                 if position + head.size > len(content):
-                    raise ValueError(f"it promises {element.count} of {element.name} and ends before")
+                    raise ValueError(f"wanted {element.count} of {element.name}, but the file ends before")
                 (length,) = head.unpack_from(content, position)
                 position += head.size
             if not 0 <= length * size <= len(content) - position:
-                raise ValueError(f"a list of {element.name} has {length} entries and ends before")
+                raise ValueError(f"a list of {element.name} has {length} entries, but the file ends before")
             if head and wanted and number in wanted:
                 add_fan(corners, struct.unpack_from(f"{order}{length}{code}", content, position))
             position += length * size
@@ -180,7 +182,7 @@ def _read_binary_lists(
 def _read_equal_lists(
     content: bytes, order: str, element: _Element, position: int, wanted: list[int] | None, corners: array
 ) -> int | None:
-    """Read an element at once if its only list has 3 entries in each row, which is what most files hold; else return None."""
+    """Read an element with one NumPy call if its only list has 3 entries in each row, as in most files; else return None."""
     if sum(bool(c.count_code) for c in element.properties) != 1 or not wanted:
         return None
     fields = []

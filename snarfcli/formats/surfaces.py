@@ -1,4 +1,4 @@
-"""Reading the surface in a mesh file of any common format, and finding such files."""
+"""Read the surface in a mesh file of a common format, and list such files in a folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, one_line
 from snarfcli.formats.gltf import read_gltf_surface
 from snarfcli.formats.plain_meshes import MAX_FACES, parse_obj, parse_off, parse_stl
 from snarfcli.formats.ply import parse_ply
@@ -16,19 +16,19 @@ from snarfcli.formats.ply import parse_ply
 __all__ = ["SURFACE_SUFFIXES", "list_surfaces", "read_surface"]
 
 SURFACE_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-"""Formats that `read_surface` reads, in lower case."""
+"""File suffixes that `read_surface` accepts, in lower case."""
 
 _PARSERS = {".obj": parse_obj, ".off": parse_off, ".ply": parse_ply, ".stl": parse_stl}
 _MAX_BYTES = 64 * 2**20
-# A word of text takes up to 60 bytes once it is split. PLY files are split as a whole, the others line by line.
+# A word of text takes up to 60 bytes after splitting. PLY files are split as a whole, the others line by line.
 _MAX_WORDS = 8_000_000
 
 
 def list_surfaces(folder: str | Path) -> list[Path]:
-    """Return the mesh files of one folder, `frame_2` before `frame_10`; hidden files and folders below it are left out.
+    """Return the mesh files directly inside a folder, `frame_2` before `frame_10`; hidden files are left out.
 
     Raises:
-        UserError: there is no such folder, or it cannot be opened.
+        UserError: the folder does not exist or cannot be opened.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -41,59 +41,62 @@ def list_surfaces(folder: str | Path) -> list[Path]:
 
 
 def _natural(path: Path) -> tuple[list[tuple[int, str]], str]:
-    """Return a key by which numbers in names sort by value."""
+    """Return a sort key that compares numbers in names by value."""
     parts = re.split(r"([0-9]+)", path.name.lower())
-    # Numbers as text, padded by their length: a name may hold more digits than Python turns into a number.
+    # Numbers stay text, compared by length first: a name may hold more digits than Python converts to an integer.
     return [(len(p.lstrip("0")), p.lstrip("0")) if i % 2 else (-1, p) for i, p in enumerate(parts)], path.name
 
 
 def read_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Read the triangles of a mesh file; see `SURFACE_SUFFIXES`.
+    """Read the triangles of a mesh file in one of the formats of `SURFACE_SUFFIXES`.
 
-    Polygons are cut into fans of triangles, the objects or solids of a file are one surface, and glTF scenes come with their
-    transforms and skins in the pose of the nodes. Materials and textures are not looked at, and of files beside this one only
-    the buffers of a `.gltf` are opened. The vertices come in the order of the file, all of them: an OBJ file's by its `v`
-    lines, whatever its texture coordinates. Triangles that name a vertex twice are dropped.
+    Polygons are cut into fans of triangles. All objects or solids of a file form one surface. The transforms of a glTF scene
+    are applied, and its skins take the pose of the nodes. Materials and textures are ignored; no other file is opened except
+    the buffers of a `.gltf`. All vertices are kept, in the order of the file: those of an OBJ file are its `v` lines,
+    independent of texture coordinates. Triangles that name a vertex twice are dropped.
 
-    Where a surface is open as stored, vertices in the same place to the last bit are merged into the first of them, which
-    closes what was only split along seams; STL and glTF files, which have to be split, are always merged. A closed surface of
-    another format stays as it is, so that meshes of one topology keep it.
+    If the stored surface is open, vertices with bitwise equal positions are merged into the first of them. This closes surfaces
+    that were only split along seams. STL and glTF files, whose formats require such splits, are always merged. A closed surface
+    of another format is not changed, so meshes of one topology keep it.
 
     Args:
         path: the file.
 
     Returns:
-        Vertices [V, 3] float64 in the units and axes of the file, and faces [F, 3] int64, F > 0.
+        vertices: [V, 3], float64, units and axes of the file.
+        faces: [F, 3], int64, F > 0.
 
     Raises:
-        UserError: the file is missing, damaged, absurdly large, of another format, or holds no triangles, as point clouds do.
+        UserError: the file is missing, damaged, too large, of an unknown format, or has no triangles (a point cloud).
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in SURFACE_SUFFIXES:
-        raise UserError(f"mesh {path} is of no known format; give one of {', '.join(SURFACE_SUFFIXES)}")
+        raise UserError(
+            f"mesh {path}: wanted a file ending in {', '.join(SURFACE_SUFFIXES)}, got {suffix or 'no ending'!r:.40}"
+        )
     if suffix in (".glb", ".gltf"):
         vertices, faces = read_gltf_surface(path)
     else:
         content = _read_bytes(path)
         try:
-            with np.errstate(invalid="ignore"):  # NaN is refused below
+            with np.errstate(invalid="ignore"):  # NaN is rejected below
                 vertices, faces = _PARSERS[suffix](content)
         except (ValueError, OverflowError, MemoryError) as error:
-            raise UserError(f"mesh {path} cannot be read ({_one_line(error)}); copy it again or export it anew") from None
+            raise UserError(f"mesh {path} cannot be read ({one_line(error, 200)}); copy it again or export it again") from None
     if not len(faces):
-        raise UserError(f"mesh {path} holds no triangles (a point cloud is not a surface); give a mesh with faces")
+        raise UserError(f"mesh {path} has no triangles (a point cloud is not a surface); give a mesh with faces")
     if len(faces) > MAX_FACES:
-        raise UserError(f"mesh {path} has {len(faces)} triangles, more than {MAX_FACES}; simplify it")
+        raise UserError(f"mesh {path}: wanted at most {MAX_FACES} triangles, got {len(faces)}; simplify it")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise UserError(f"mesh {path} has faces that name vertices beyond its {len(vertices)}; export it anew")
+        raise UserError(f"mesh {path} has faces that refer to vertices beyond its {len(vertices)}; export it again")
     if not np.isfinite(vertices).all():
-        raise UserError(f"mesh {path} holds NaN or infinity among its vertices; repair it or export it anew")
+        raise UserError(f"mesh {path} has NaN or infinity among its vertices; repair it or export it again")
     faces = _with_area(faces)
     if suffix == ".stl" or (suffix in _PARSERS and _is_open(faces, len(vertices))):
         vertices, faces = _merged(vertices, faces, keep_all=suffix != ".stl")
     if not len(faces):
-        raise UserError(f"mesh {path} has only triangles without area; give a mesh with a surface")
+        raise UserError(f"mesh {path} has only triangles of zero area; give a mesh with a surface")
     return vertices, faces
 
 
@@ -101,27 +104,27 @@ def _read_bytes(path: Path) -> bytes:
     try:
         if not path.exists():
             raise UserError(f"no mesh at {path}")
-        if not path.is_file():  # a pipe would wait forever
+        if not path.is_file():  # reading a pipe would block forever
             raise UserError(f"mesh {path} is not a file; give one of {', '.join(SURFACE_SUFFIXES)}")
         if path.stat().st_size > _MAX_BYTES:
-            raise UserError(f"mesh {path} has over {_MAX_BYTES // 2**20} MiB; simplify it, or save it as .glb")
+            raise UserError(f"mesh {path} is larger than {_MAX_BYTES // 2**20} MiB; simplify it, or save it as .glb")
         content = path.read_bytes()
     except OSError as error:
         raise UserError(f"mesh {path} cannot be opened ({error.strerror or error})") from None
     if content.startswith(b"ply") and b"format ascii" in content[:1000]:
         values = np.frombuffer(content, np.uint8)
         if sum(np.count_nonzero(np.diff(piece <= 32)) for piece in np.array_split(values, 32)) > 2 * _MAX_WORDS:
-            raise UserError(f"mesh {path} has too many words to be read as text; simplify it, or save it as binary")
+            raise UserError(f"mesh {path} has over {_MAX_WORDS} words of text; simplify it, or save it as binary")
     return content
 
 
 def _with_area(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Drop the triangles that name a vertex twice."""
+    """Return the triangles that name three different vertices."""
     return faces[(faces != np.roll(faces, 1, 1)).all(1)]
 
 
 def _is_open(faces: NDArray[np.int64], num_vertices: int) -> bool:
-    """Return whether an edge belongs to one triangle only."""
+    """Return whether some edge belongs to only one triangle."""
     edges = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
     _, counts = np.unique(edges.min(1) * num_vertices + edges.max(1), return_counts=True)
     return bool((counts == 1).any())
@@ -130,14 +133,14 @@ def _is_open(faces: NDArray[np.int64], num_vertices: int) -> bool:
 def _merged(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], *, keep_all: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Let each vertex be the first one in the same place, and drop the triangles that lose their area by it.
+    """Merge vertices of equal position into the first of them, and drop the triangles that become degenerate.
 
     Args:
         vertices: [V, 3].
         faces: [F, 3].
-        keep_all: keep vertices that no triangle uses; those merged into another go in any case.
+        keep_all: keep vertices that no triangle uses; merged vertices are removed in any case.
     """
-    rows = np.ascontiguousarray(vertices + 0.0)  # makes -0.0 the same as 0.0
+    rows = np.ascontiguousarray(vertices + 0.0)  # turns -0.0 into 0.0
     keys = rows.view(np.dtype((np.void, 24)))[:, 0]
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     target = first[inverse.reshape(-1)]
@@ -146,9 +149,3 @@ def _merged(
     if not keep_all:
         is_kept &= np.isin(np.arange(len(vertices)), faces)
     return vertices[is_kept], (np.cumsum(is_kept) - 1)[faces]
-
-
-def _one_line(error: Exception) -> str:
-    """Return the start of an error's message, without line ends, controls and whatever else cannot be printed."""
-    reason = str(error) or type(error).__name__
-    return "".join(letter if letter.isprintable() else " " for letter in reason)[:200]

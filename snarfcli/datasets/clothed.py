@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from snarfcli.bodies import Body, axis_angle_to_matrix, builtin_body, find_body, load_body
+from snarfcli.bodies.skinning import blend_transforms, transform_points
 from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject, check_subject
 from snarfcli.datasets.folds import Folds, place_folds
 from snarfcli.datasets.garment import ClothedMesh, Outfit, dress
@@ -108,9 +109,9 @@ class ClothedBody:
         vertices = np.empty((len(poses), len(rest), 3))
         corrected = self._correctives(poses) - self._correctives(skeleton.canonical_pose.numpy()[None])
         for index in range(len(poses)):  # one at a time: the transforms of many vertices are large
-            blended = (weights @ posed_from_rest[index].reshape(-1, 16)).reshape(-1, 4, 4)
+            blended = blend_transforms(weights, posed_from_rest[index])
             local = rest + mesh.follow(corrected[index]) + facing * height[index, :, None]
-            vertices[index] = np.einsum("vij,vj->vi", blended[:, :3, :3], local) + blended[:, :3, 3]
+            vertices[index] = transform_points(blended, local)
         return vertices if translation is None else vertices + np.asarray(translation)[:, None]
 
     def turned(self, poses: NDArray) -> NDArray[np.float64]:
@@ -145,8 +146,8 @@ class ClothedBody:
         facing = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
         folds = place_folds(mesh.vertices, facing, mesh.stand_off_m, joints, int(self.bare.subject))
         canonical = skeleton.posed_from_rest(skeleton.canonical_pose[None].to(torch.float64))[0].numpy()
-        rest_from_canonical = np.linalg.inv((weights @ canonical.reshape(-1, 16)).reshape(-1, 4, 4))
-        rest = np.einsum("vij,vj->vi", rest_from_canonical[:, :3, :3], mesh.vertices) + rest_from_canonical[:, :3, 3]
+        rest_from_canonical = np.linalg.inv(blend_transforms(weights, canonical))
+        rest = transform_points(rest_from_canonical, mesh.vertices)
         return mesh, weights, rest, np.einsum("vij,vj->vi", rest_from_canonical[:, :3, :3], facing), folds
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.files import file_digest
 
 if TYPE_CHECKING:
@@ -130,9 +131,7 @@ class RigMeshes:
         return self.chosen(np.array([index]))[0]
 
     def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
-        rows = self.posed_from_rest[frames][:, :, :3].reshape(len(frames), -1, 12)
-        blended = (self.weights @ rows).reshape(len(frames), -1, 3, 4)
-        posed = np.einsum("tvrc,vc->tvr", blended[..., :3], self.vertices) + blended[..., 3]
+        posed = skin_vertices(self.vertices, self.weights, self.posed_from_rest[frames])
         return ArrayMeshes(posed.astype(np.float32), self.faces.astype(np.int32))
 
     def source(self, index: int) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.checks import check_number
 from snarfcli.errors import UserError
 from snarfcli.export.decimate import decimate
@@ -29,7 +30,7 @@ from snarfcli.export.rig import (
 )
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
-from snarfcli.meshing.skinned import SkinnedSurface, skin_vertices, skinned_surface
+from snarfcli.meshing.skinned import SkinnedSurface, skinned_surface
 from snarfcli.progress import progress
 
 if TYPE_CHECKING:

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from snarfcli.bodies import Skeleton
+from snarfcli.bodies.skinning import blend_transforms
 
 __all__ = ["dense_weights", "few_influences", "trial_poses"]
 
@@ -103,7 +104,7 @@ def _fitted(
     apart = np.empty((*joints.shape, len(transforms), 3))
     weights = weights.astype(np.float64)
     for pose, (matrices, share) in enumerate(zip(transforms[:, :, :3], np.sqrt(counts), strict=True)):
-        blended = (weights @ matrices.reshape(-1, 12)).reshape(-1, 1, 3, 4)
+        blended = blend_transforms(weights, matrices)[:, None]
         apart[:, :, pose] = share * np.einsum("ncab,nb->nca", matrices[joints] - blended, points)
     apart = apart.reshape(*joints.shape, -1)
     products = apart @ apart.transpose(0, 2, 1)

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import nearest_rotation
-from snarfcli.meshing.mesh import Mesh
 from snarfcli.bodies.skinning import skin_vertices
+from snarfcli.meshing.mesh import Mesh
 from snarfcli.motions import Motion
 
 __all__ = [

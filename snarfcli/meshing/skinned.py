@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
 from snarfcli.meshing.surfaces import canonical_surface, check_posed, in_chunks
@@ -18,7 +19,7 @@ from snarfcli.models.trained_field import TrainedField
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-__all__ = ["Followed", "SkinnedSurface", "skin_vertices", "skinned_surface"]
+__all__ = ["Followed", "SkinnedSurface", "skinned_surface"]
 
 # The motion of the shape with the pose is found at the vertices of a coarser mesh, 2 cm apart on a body, and interpolated:
 # against finding it at every vertex of a mesh of 256, 0.2 to 0.4 mm off in the mean (benchmarks/bm_surfaces.py).
@@ -225,15 +226,3 @@ def _nearest_points(vertices: NDArray[np.float32], mesh: Mesh) -> tuple[NDArray[
     a, b, c = (np.ascontiguousarray(corners[index[:, k]]) for k in range(3))
     shares = igl.barycentric_coordinates(np.ascontiguousarray(nearest), a, b, c)
     return index, np.asarray(shares, dtype=np.float32)
-
-
-def skin_vertices(vertices: NDArray, weights: NDArray, transforms: NDArray) -> NDArray:
-    """Move canonical vertices by linear blend skinning, in the precision of the most precise input (S Eq. 4).
-
-    Args:
-        vertices: [V, 3] metres.
-        weights: [V, J], rows sum to 1.
-        transforms: [J, 4, 4] canonical to posed, metres.
-    """
-    blended = (weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
-    return np.einsum("vrc,vc->vr", blended[:, :, :3], vertices) + blended[:, :, 3]

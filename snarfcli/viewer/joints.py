@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from snarfcli.bodies import Skeleton
+from snarfcli.bodies.skinning import transform_points
 from snarfcli.motions.joint_names import find_body_parts
 
 __all__ = [
@@ -96,7 +97,7 @@ def mirrored_joint(skeleton: Skeleton, joint: int, vector: NDArray[np.float64]) 
 def posed_joints(skeleton: Skeleton, transforms: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the joints [J, 3] under bone transforms [J, 4, 4], canonical to posed, metres."""
     joints_c = skeleton.canonical_joints.cpu().numpy().astype(np.float32)
-    return np.einsum("jrc,jc->jr", transforms[:, :3, :3], joints_c) + transforms[:, :3, 3]
+    return transform_points(transforms, joints_c)
 
 
 def pose_file(pose: NDArray[np.float64], translation: NDArray[np.float64]) -> bytes:

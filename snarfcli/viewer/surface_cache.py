@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
-from snarfcli.meshing.skinned import skin_vertices
 from snarfcli.viewer.body import (
     Body,
     CanonicalMade,

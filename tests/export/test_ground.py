@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from toy_character import ToyCharacter, wave
 
+from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.export.rig import Clip, clip_transforms, lowest_point, on_ground
-from snarfcli.meshing.skinned import skin_vertices
 
 TOY = ToyCharacter()
 MESH = TOY.skinned_surface(32).mesh

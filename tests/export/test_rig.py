@@ -6,6 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from toy_character import BONE, JOINTS, ToyCharacter, stretched, wave
 
+from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.export.rig import (
     Clip,
     bind_frames,
@@ -15,7 +16,6 @@ from snarfcli.export.rig import (
     recompose,
     unique_names,
 )
-from snarfcli.meshing.skinned import skin_vertices
 
 TOY = ToyCharacter()
 PARENTS = TOY.skeleton.parents

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from snarfcli.bodies import SMPL_JOINT_NAMES
-from snarfcli.formats.rig import Clip, Rig
+from snarfcli.formats.rig import Rig, RigClip
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS, joint_positions
 
 _SIDED_CMU = {
@@ -74,7 +74,7 @@ def rig_of(
     posed = np.tile(np.eye(4), (len(poses), 24, 1, 1))
     posed[..., :3, :3] = world @ turns @ rest_turns[0].transpose(0, 2, 1) @ world.T
     posed[..., :3, 3] = scale * places @ world.T
-    return Rig(names, PARENTS, rest, (Clip("walk", frame_rate, posed),))
+    return Rig(names, PARENTS, rest, (RigClip("walk", frame_rate, posed),))
 
 
 def write_bvh(path: Path, rig: Rig, order: str = "ZXY", end: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Path:

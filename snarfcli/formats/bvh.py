@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from snarfcli.errors import UserError
-from snarfcli.formats.rig import Clip, Rig
+from snarfcli.formats.rig import Rig, RigClip
 
 __all__ = ["read_bvh"]
 
@@ -90,7 +90,7 @@ def read_bvh(path: str | Path) -> Rig:
         raise UserError(f"BVH file {path} cannot be read ({error.strerror or error})") from None
     with np.errstate(over="ignore", invalid="ignore"):
         rest = _rest(joints)
-        clips = (Clip(path.stem, frame_rate, _world(joints, values)),) if len(values) else ()
+        clips = (RigClip(path.stem, frame_rate, _world(joints, values)),) if len(values) else ()
         is_sane = all(np.isfinite(world[..., 3].sum()) for world in (rest, *(clip.world_from_joint for clip in clips)))
     if not is_sane:
         raise UserError(f"BVH file {path} holds numbers too large to add up; export or download it again")

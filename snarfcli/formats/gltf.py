@@ -19,7 +19,7 @@ from snarfcli.formats.gltf_mesh import MeshReader, Piece, dense_weights, join_pi
 from snarfcli.formats.gltf_motion import read_animations
 from snarfcli.formats.gltf_nodes import NodeTree
 from snarfcli.formats.gltf_place import placed_skins
-from snarfcli.formats.rig import Clip, Rig, RigMesh
+from snarfcli.formats.rig import Rig, RigClip, RigMesh
 
 __all__ = ["read_gltf", "read_gltf_surface"]
 
@@ -101,7 +101,7 @@ def read_gltf(path: str | Path, *, frame_rate: float | None = None) -> Rig:
             for column, joint in enumerate(joints):
                 poses[:, column] = worlds[joint]
             _check_transforms(file, poses, names, f" in clip {name}")
-            clips.append(Clip(name, animation.frame_rate, poses))
+            clips.append(RigClip(name, animation.frame_rate, poses))
         whole = welded(join_pieces(pieces))
         mesh = None
         if len(whole.faces):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from snarfcli.formats.gltf_file import GltfFile
 
-__all__ = ["Animation", "read_animations"]
+__all__ = ["GltfAnimation", "read_animations"]
 
 _WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 _MAX_CHANNELS = 30_000
@@ -31,7 +31,7 @@ _EPSILON = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Animation:
+class GltfAnimation:
     """Some nodes over time."""
 
     name: str
@@ -75,7 +75,7 @@ class _Track:
         return int(self.duration * frame_rate + _EPSILON * frame_rate + 1e-6) + 1
 
 
-def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[Animation]:
+def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[GltfAnimation]:
     """Sample every animation that moves a node; those of morph targets are left out.
 
     Args:
@@ -110,7 +110,7 @@ def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[Ani
                     file.fail(f"{track.what}: a rotation of node {node} is a zero quaternion; export it again")
                 sampled = sampled / length
             nodes.setdefault(node, {})[path] = sampled
-        found.append(Animation(track.name, float(rate), frames, nodes))
+        found.append(GltfAnimation(track.name, float(rate), frames, nodes))
     return found
 
 

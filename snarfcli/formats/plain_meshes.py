@@ -11,7 +11,7 @@ valid files differently, even with `process=False, maintain_order=True`:
 - OFF and PLY: triangles come before quads and larger polygons, so the order of the faces changes, and quads start elsewhere.
 - PLY, binary: polygons of different sizes, or bytes after the data, raise ("unexpected length").
 - STL, binary: with bytes after the triangles it returns no triangles and no error.
-- On 2,000 damaged OBJ files, 22 led to meshes that the checks of `read_surface` do not expect (vertices of 2 or 4 numbers).
+- On 2,000 damaged OBJ files, 22 led to meshes that the checks of `read_surface` do not expect (vertices of 1 or 2 numbers).
 """
 
 from __future__ import annotations

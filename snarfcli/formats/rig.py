@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Clip", "Rig", "RigMesh"]
+__all__ = ["Rig", "RigClip", "RigMesh"]
 
 
 @dataclass(frozen=True, eq=False)
-class Clip:
+class RigClip:
     """One motion of a rig, sampled at equal times."""
 
     name: str
@@ -44,7 +44,7 @@ class Rig:
     """J parents, -1 for a root; a parent comes before its children, joint 0 is a root."""
     rest: NDArray[np.float64]
     """[J, 4, 4] where each joint is at rest: from its own frame to the world, units of the file."""
-    clips: tuple[Clip, ...]
+    clips: tuple[RigClip, ...]
     """The motions, none or more."""
     mesh: RigMesh | None = None
     """The mesh, if the file has one."""

@@ -52,12 +52,12 @@ def builtin_motion(name: str, seed: int = 0, *, duration_s: float | None = None,
         raise ValueError(f"duration_s, frame_rate: wanted at least one frame, got {duration_s} s at {frame_rate} a second")
     t = np.arange(frames) / frame_rate
     style = Style(np.random.default_rng([seed, zlib.crc32(name.encode())]))
-    scene = _EXERCISES[name](style, t) if name in _EXERCISES else perform(EXTREMES[name], style, t, duration_s)
-    poses = poses_from_angles(scene.angles, frames)
-    if scene.feet:
-        translation = scene.pelvis
-        for side, path in scene.feet.items():
+    exercise = _EXERCISES[name](style, t) if name in _EXERCISES else perform(EXTREMES[name], style, t, duration_s)
+    poses = poses_from_angles(exercise.angles, frames)
+    if exercise.feet:
+        translation = exercise.pelvis
+        for side, path in exercise.feet.items():
             poses = plant_foot(poses, translation, side, path)
     else:
-        translation = stand_on_floor(poses, frame_rate) + scene.pelvis
+        translation = stand_on_floor(poses, frame_rate) + exercise.pelvis
     return Motion(name, poses, translation, float(frame_rate))

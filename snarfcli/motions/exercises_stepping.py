@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.motions.curves import Style, hop, pulse
-from snarfcli.motions.scene import Scene, add, stand
+from snarfcli.motions.exercise import Exercise, add, stand
 
 __all__ = ["STEPPING_EXERCISES"]
 
@@ -19,75 +19,75 @@ Array = NDArray[np.float64]
 _TURN = 2 * np.pi
 
 
-def _hopping(scene: Scene, lift: Array, extension: Array, sides: str = "lr", point_deg: float = 30.0) -> None:
+def _hopping(exercise: Exercise, lift: Array, extension: Array, sides: str = "lr", point_deg: float = 30.0) -> None:
     """Move pelvis and feet up and down with a hop on the balls of the feet, which point at the floor in flight."""
-    scene.pelvis[:, 1] += lift + 0.0017 * point_deg  # a lifted heel lengthens the leg
+    exercise.pelvis[:, 1] += lift + 0.0017 * point_deg  # a lifted heel lengthens the leg
     for side in sides:
-        foot = scene.feet[side]
+        foot = exercise.feet[side]
         foot.y = foot.y + np.maximum(lift, 0)
         foot.heel = foot.heel + point_deg * (0.2 + 0.8 * extension)
 
 
-def _jumping_jacks(style: Style, t: Array) -> Scene:
-    scene = stand(style, t)
+def _jumping_jacks(style: Style, t: Array) -> Exercise:
+    exercise = stand(style, t)
     tempo = style.around(0.95, 0.1)
     phase = style.phase(t, tempo)
     # Two hops a cycle: legs go apart in the first flight, together in the second.
     lift, extension = hop(2 * phase, 0.5 / tempo, style.around(0.045, 0.25))
     opened = 0.5 - 0.5 * np.cos(_TURN * (phase - 0.09))
-    _hopping(scene, lift, extension)
+    _hopping(exercise, lift, extension)
     width = style.around(0.26, 0.12)
-    scene.pelvis[:, 1] -= 0.045 * opened
+    exercise.pelvis[:, 1] -= 0.045 * opened
     raised = style.around(158, 0.08)
     for side, sign in (("l", 1), ("r", -1)):
-        scene.feet[side].x = scene.feet[side].x + sign * width * opened
-        scene.feet[side].yaw = scene.feet[side].yaw + 8 * opened
+        exercise.feet[side].x = exercise.feet[side].x + sign * width * opened
+        exercise.feet[side].yaw = exercise.feet[side].yaw + 8 * opened
         delay = style.between(-0.02, 0.02)
         up = 0.5 - 0.5 * np.cos(_TURN * (phase - 0.07 + delay))
-        scene.angles |= {
+        exercise.angles |= {
             f"{side}_arm_abd": 15 + (raised - 15) * up + style.noise(t, 2),
             f"{side}_arm_flex": 8 + style.around(14, 0.5) * np.sin(np.pi * up) + style.noise(t, 2),
             f"{side}_arm_roll": style.around(24, 0.4) * up,
             f"{side}_elbow": style.around(14, 0.5) + style.around(22, 0.4) * up + style.noise(t, 2),
             f"{side}_pron": 10 + 10 * up + style.noise(t, 3),
         }
-    add(scene, head_nod=-6 * opened, spine_flex=-4 * opened)
-    return scene
+    add(exercise, head_nod=-6 * opened, spine_flex=-4 * opened)
+    return exercise
 
 
-def _knees(style: Style, t: Array) -> Scene:
-    scene = stand(style, t)
+def _knees(style: Style, t: Array) -> Exercise:
+    exercise = stand(style, t)
     phase = style.phase(t, style.around(0.62, 0.12))
     height = style.around(88, 0.12)
     for side, other, delay in (("l", "r", 0.0), ("r", "l", 0.5)):
         raised = pulse(phase, delay + 0.25, 0.5)
-        foot = scene.feet[side]
+        foot = exercise.feet[side]
         # the knee rises in front, its shank hanging: the foot's way is that of the ball below a bent leg
         foot.y = foot.y + style.around(0.46, 0.1) * raised * height / 88
         foot.z = foot.z + (0.20 + style.between(-0.04, 0.04)) * raised
         foot.heel = foot.heel + style.around(28, 0.4) * raised
         sign = 1 if side == "l" else -1
-        scene.pelvis[:, 0] -= sign * 0.055 * raised
-        add(scene, pelvis_list=-sign * 4 * raised, pelvis_tilt=-7 * raised, spine_flex=9 * raised)
-        add(scene, spine_twist=-sign * style.around(9, 0.4) * raised)
+        exercise.pelvis[:, 0] -= sign * 0.055 * raised
+        add(exercise, pelvis_list=-sign * 4 * raised, pelvis_tilt=-7 * raised, spine_flex=9 * raised)
+        add(exercise, spine_twist=-sign * style.around(9, 0.4) * raised)
         swing = style.around(34, 0.3)
-        add(scene, **{f"{other}_arm_flex": swing * raised, f"{other}_elbow": style.around(45, 0.4) * raised})
-        add(scene, **{f"{side}_arm_flex": -14 * raised, f"{side}_elbow": 14 * raised})
-    return scene
+        add(exercise, **{f"{other}_arm_flex": swing * raised, f"{other}_elbow": style.around(45, 0.4) * raised})
+        add(exercise, **{f"{side}_arm_flex": -14 * raised, f"{side}_elbow": 14 * raised})
+    return exercise
 
 
-def _light_hopping(style: Style, t: Array, loose: float) -> Scene:
-    scene = stand(style, t)
+def _light_hopping(style: Style, t: Array, loose: float) -> Exercise:
+    exercise = stand(style, t)
     tempo = style.around(2.15, 0.1)
     phase = style.phase(t, tempo)
     lift, extension = hop(phase, 1 / tempo, style.around(0.036, 0.25))
-    _hopping(scene, lift, extension, point_deg=style.around(30, 0.2))
+    _hopping(exercise, lift, extension, point_deg=style.around(30, 0.2))
     wave = np.sin(_TURN * phase)
     for side in "lr":
         late = np.sin(_TURN * (phase - 0.2 - style.between(0, 0.08)))
         later = np.sin(_TURN * (phase - 0.36))
         add(
-            scene,
+            exercise,
             **{
                 f"{side}_arm_abd": loose * (8 + style.around(9) * late) - 2 * (1 - loose),
                 f"{side}_arm_flex": loose * style.around(9) * late,
@@ -97,38 +97,38 @@ def _light_hopping(style: Style, t: Array, loose: float) -> Scene:
                 f"{side}_shrug": 2 + (2 + 6 * loose) * late,
             },
         )
-    add(scene, spine_flex=(1 + 3 * loose) * wave, head_nod=(1.5 + 5 * loose) * np.sin(_TURN * (phase - 0.15)))
-    add(scene, spine_twist=loose * style.noise(t, 6), head_turn=loose * style.noise(t, 6))
-    return scene
+    add(exercise, spine_flex=(1 + 3 * loose) * wave, head_nod=(1.5 + 5 * loose) * np.sin(_TURN * (phase - 0.15)))
+    add(exercise, spine_twist=loose * style.noise(t, 6), head_turn=loose * style.noise(t, 6))
+    return exercise
 
 
-def _on_one_leg(style: Style, t: Array, scene: Scene) -> tuple[str, str, int]:
+def _on_one_leg(style: Style, t: Array, exercise: Exercise) -> tuple[str, str, int]:
     """Shift the weight over one foot, for good: the pelvis above it, the trunk upright. Returns stance, free side, sign."""
     stance, free, sign = ("l", "r", 1) if style.rng.uniform() < 0.5 else ("r", "l", -1)
-    foot = scene.feet[stance]
+    foot = exercise.feet[stance]
     foot.x = foot.x * 0 - sign * 0.02
     foot.z = foot.z * 0 + 0.0
-    scene.pelvis[:, 0] += sign * 0.075
-    add(scene, pelvis_list=sign * style.around(3, 0.5), spine_bend=sign * style.around(2, 0.5))
+    exercise.pelvis[:, 0] += sign * 0.075
+    add(exercise, pelvis_list=sign * style.around(3, 0.5), spine_bend=sign * style.around(2, 0.5))
     return stance, free, sign
 
 
-def _one_leg_jump(style: Style, t: Array) -> Scene:
-    scene = stand(style, t)
-    stance, free, _ = _on_one_leg(style, t, scene)
+def _one_leg_jump(style: Style, t: Array) -> Exercise:
+    exercise = stand(style, t)
+    stance, free, _ = _on_one_leg(style, t, exercise)
     tempo = style.around(1.8, 0.1)
     phase = style.phase(t, tempo)
     lift, extension = hop(phase, 1 / tempo, style.around(0.045, 0.25))
-    _hopping(scene, lift, extension, stance)
+    _hopping(exercise, lift, extension, stance)
     wave, late = np.sin(_TURN * phase), np.sin(_TURN * (phase - 0.2))
-    foot = scene.feet[free]
+    foot = exercise.feet[free]
     foot.y = foot.y + style.around(0.26, 0.25) + lift + 0.02 * late
     foot.z = foot.z + style.between(-0.28, -0.08) + 0.02 * late
     foot.heel = foot.heel + style.around(48, 0.25)
     abd = style.around(30, 0.3)
     for side in "lr":
         add(
-            scene,
+            exercise,
             **{
                 f"{side}_arm_abd": style.around(abd, 0.2) + 11 * late,
                 f"{side}_arm_flex": style.around(14, 0.5) + 9 * late,
@@ -136,16 +136,16 @@ def _one_leg_jump(style: Style, t: Array) -> Scene:
                 f"{side}_shrug": 3 + 4 * late,
             },
         )
-    add(scene, pelvis_tilt=5 + 3 * wave, spine_flex=4 + 2 * wave, head_nod=3 * late)
-    return scene
+    add(exercise, pelvis_tilt=5 + 3 * wave, spine_flex=4 + 2 * wave, head_nod=3 * late)
+    return exercise
 
 
-def _one_leg_loose(style: Style, t: Array) -> Scene:
-    scene = stand(style, t)
-    _, free, sign = _on_one_leg(style, t, scene)
+def _one_leg_loose(style: Style, t: Array) -> Exercise:
+    exercise = stand(style, t)
+    _, free, sign = _on_one_leg(style, t, exercise)
     shake = style.phase(t, style.around(2.3, 0.15))
     slow = style.noise(t, 1.0, 0.1, 0.45)
-    foot = scene.feet[free]
+    foot = exercise.feet[free]
     foot.y = foot.y + style.around(0.14, 0.3) + 0.03 * slow + 0.035 * np.sin(_TURN * shake)
     foot.z = foot.z + 0.20 + 0.09 * slow + 0.045 * np.sin(_TURN * (shake - 0.2))
     foot.x = foot.x - sign * (0.07 + 0.03 * style.noise(t, 1.0, 0.1, 0.45) + 0.025 * np.sin(_TURN * (shake + 0.1)))
@@ -153,48 +153,48 @@ def _one_leg_loose(style: Style, t: Array) -> Scene:
     foot.yaw = foot.yaw + 9 * np.sin(_TURN * (shake - 0.25))
     for side in "lr":
         add(
-            scene,
+            exercise,
             **{
                 f"{side}_arm_abd": style.around(26, 0.4) + style.noise(t, 6),
                 f"{side}_arm_flex": style.around(8, 0.6) + style.noise(t, 5),
                 f"{side}_elbow": style.around(18, 0.5) + style.noise(t, 5),
             },
         )
-    return scene
+    return exercise
 
 
-def _running_on_spot(style: Style, t: Array) -> Scene:
-    scene = stand(style, t)
+def _running_on_spot(style: Style, t: Array) -> Exercise:
+    exercise = stand(style, t)
     tempo = style.around(1.35, 0.1)
     phase = style.phase(t, tempo)
     # Each foot is down around its own half cycle; in between both are in the air.
     lift, _ = hop(2 * phase - 0.17, 0.5 / tempo, style.around(0.03, 0.3))
-    scene.pelvis[:, 1] += lift + 0.03
+    exercise.pelvis[:, 1] += lift + 0.03
     knee_high, heel_back = style.around(0.34, 0.2), style.around(0.16, 0.3)
     pump = style.around(34, 0.2)
     for side, sign, delay in (("l", 1, 0.0), ("r", -1, 0.5)):
         swing = pulse(phase, delay + 0.25, 0.72)
         late = pulse(phase, delay + 0.17, 0.62)
-        foot = scene.feet[side]
+        foot = exercise.feet[side]
         foot.y = foot.y + knee_high * swing
         foot.z = foot.z + 0.12 * swing - heel_back * late
         foot.heel = foot.heel + 12 + style.around(44, 0.15) * late
         foot.yaw = foot.yaw * 0.5
         beat = np.cos(_TURN * (phase - delay - 0.25))  # this arm goes back when this knee is up
-        scene.angles |= {
+        exercise.angles |= {
             f"{side}_arm_flex": 4 - pump * beat + style.noise(t, 2),
             f"{side}_arm_abd": style.around(24, 0.15) + style.noise(t, 2),
             f"{side}_arm_roll": -style.around(4, 0.8) + style.noise(t, 2),
             f"{side}_elbow": style.around(86, 0.1) - 14 * beat + style.noise(t, 2),
             f"{side}_curl": 55 + style.noise(t, 3),
         }
-        scene.pelvis[:, 0] -= sign * 0.02 * swing
-        add(scene, pelvis_turn=sign * -4 * beat, spine_twist=sign * 9 * beat, pelvis_list=-sign * 2.5 * swing)
-    add(scene, pelvis_tilt=5.0, spine_flex=4.0, head_nod=-4.0)
-    return scene
+        exercise.pelvis[:, 0] -= sign * 0.02 * swing
+        add(exercise, pelvis_turn=sign * -4 * beat, spine_twist=sign * 9 * beat, pelvis_list=-sign * 2.5 * swing)
+    add(exercise, pelvis_tilt=5.0, spine_flex=4.0, head_nod=-4.0)
+    return exercise
 
 
-STEPPING_EXERCISES: dict[str, Callable[[Style, Array], Scene]] = {
+STEPPING_EXERCISES: dict[str, Callable[[Style, Array], Exercise]] = {
     "jumping_jacks": _jumping_jacks,
     "knees": _knees,
     "light_hopping_loose": lambda style, t: _light_hopping(style, t, 1.0),

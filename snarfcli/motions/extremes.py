@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from snarfcli.motions.anatomy import LIMITS_DEG
 from snarfcli.motions.curves import Style, through
-from snarfcli.motions.scene import Scene
+from snarfcli.motions.exercise import Exercise
 
 __all__ = ["EXTREMES", "perform"]
 
@@ -172,7 +172,7 @@ def _key_pose(name: str) -> Pose:
     return {**_EASE, **pose}
 
 
-def perform(keys: Sequence[str], style: Style, t: Array, duration_s: float) -> Scene:
+def perform(keys: Sequence[str], style: Style, t: Array, duration_s: float) -> Exercise:
     """Move smoothly from key pose to key pose, dwelling in each, with a person's own extent and timing."""
     poses = [_key_pose(name) for name in keys]
     parts = np.array([style.around(1.0, 0.2) for _ in keys])
@@ -185,4 +185,4 @@ def perform(keys: Sequence[str], style: Style, t: Array, duration_s: float) -> S
         values = [pose.get(name, 0.0) * style.around(1.0, 0.06) for pose in poses]
         curve = through(t, times, [*np.repeat(values, 2), values[-1]])
         angles[name] = np.clip(curve + style.noise(t, 1.2), low, high)
-    return Scene(angles, np.zeros((len(t), 3)))
+    return Exercise(angles, np.zeros((len(t), 3)))

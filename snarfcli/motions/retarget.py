@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.errors import UserError, nearest
-from snarfcli.formats.rig import Clip, Rig
+from snarfcli.formats.rig import Rig, RigClip
 from snarfcli.motions.joint_names import find_body_parts
 from snarfcli.motions.layouts import layout_of
 from snarfcli.motions.mapping import map_joints
@@ -40,7 +40,7 @@ _FARTHEST_M = 1e6
 _SAME_SKELETON_M = 1e-3  # how far apart joints may be, from their parents, in two files of one skeleton
 
 
-def choose_clip(rig: Rig, clip: str | int | None, path: Path) -> Clip:
+def choose_clip(rig: Rig, clip: str | int | None, path: Path) -> RigClip:
     """Return the clip of a name or number, the first by default.
 
     Raises:
@@ -64,7 +64,7 @@ def choose_clip(rig: Rig, clip: str | int | None, path: Path) -> Clip:
 
 def retarget(
     rig: Rig,
-    clip: Clip,
+    clip: RigClip,
     skeleton: Skeleton,
     *,
     path: Path,
@@ -160,7 +160,7 @@ def _straightened(rig: Rig, skeleton: Skeleton, pairs: Mapping[int, int]) -> Rig
     return replace(rig, rest=rest)
 
 
-def _turned(rig: Rig, clip: Clip, number: int, path: Path) -> Array:
+def _turned(rig: Rig, clip: RigClip, number: int, path: Path) -> Array:
     """Return the world rotations [T, 3, 3] of a joint of the rig relative to its rest, without scale."""
     rest = rig.rest[number, :3, :3]
     posed = clip.world_from_joint[:, number]
@@ -191,7 +191,7 @@ def _up(upright: Rotation, rest: Array) -> Up:
     return up_axis(upright if max(abs(mean[1]), abs(mean[2])) > 0.7 else Rotation.from_matrix(rest[None]))
 
 
-def _way(match: RestMatch, clip: Clip, root_world: Array, turn: Array) -> Array:
+def _way(match: RestMatch, clip: RigClip, root_world: Array, turn: Array) -> Array:
     """Return the translation [T, 3], metres, that puts the middle of the hips where the scaled file has it."""
     hips = [match.parts[part] for part in ("l_hip", "r_hip") if match.parts.get(part) in match.pairs]
     hips = hips if len(hips) == 2 else [0]

@@ -17,7 +17,7 @@ from toy_rigs import CMU_NAMES, MIXAMO_NAMES, a_pose, rig_of, write_bvh
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, builtin_body, forward_kinematics, legs_apart_pose
 from snarfcli.errors import UserError
-from snarfcli.formats.rig import Clip, Rig
+from snarfcli.formats.rig import Rig, RigClip
 from snarfcli.motions import builtin_motion, read_motion
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS, joint_positions
 from snarfcli.motions.retarget import choose_clip, retarget
@@ -65,7 +65,7 @@ def test_its_own_rig_may_rest_in_another_pose(motion, scale):
     )
     at = np.tile(np.eye(4), (len(motion.poses) + 1, 24, 1, 1))
     at[:, :, :3, :3], at[:, :, :3, 3] = frames[1][:, :, :3, :3], scale * frames[0].numpy()
-    rig = Rig(SMPL_JOINT_NAMES, PARENTS, at[0], (Clip("own", motion.frame_rate, at[1:]),))
+    rig = Rig(SMPL_JOINT_NAMES, PARENTS, at[0], (RigClip("own", motion.frame_rate, at[1:]),))
     back = retarget(rig, rig.clips[0], skeleton, path=Path("own.glb"), name="own")
     difference = Rotation.from_rotvec(back.poses.reshape(-1, 3)).inv() * Rotation.from_rotvec(motion.poses.reshape(-1, 3))
     assert difference.magnitude().max() < 1e-6
@@ -168,7 +168,7 @@ def test_scaled_joints_and_float32(tmp_path):
     rig = rig_of(STANDING.poses, STANDING.translation, MIXAMO_NAMES)
     size = np.diag([100.0, 100, 100, 1])
     posed = (rig.clips[0].world_from_joint @ size).astype(np.float32).astype(np.float64)
-    rig = Rig(rig.names, rig.parents, rig.rest @ size, (Clip("walk", 30.0, posed),))
+    rig = Rig(rig.names, rig.parents, rig.rest @ size, (RigClip("walk", 30.0, posed),))
     back = retarget(rig, rig.clips[0], smpl(), path=tmp_path / "a.glb", name="a")
     np.testing.assert_allclose(places(back), places(STANDING), atol=2e-6)
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from snarfcli.motions.curves import Style
 from snarfcli.motions.footing import FootPath
 
-__all__ = ["Scene", "add", "stand"]
+__all__ = ["Exercise", "add", "stand"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class Scene:
+class Exercise:
     """What a figure does, before it becomes poses."""
 
     angles: dict[str, Array]
@@ -27,7 +27,7 @@ class Scene:
     """Paths of planted feet, by side; the other legs follow the angles. With none the lowest point touches the floor."""
 
 
-def stand(style: Style, t: Array) -> Scene:
+def stand(style: Style, t: Array) -> Exercise:
     """Someone standing at ease: arms hanging, a little sway, never quite still and never quite symmetric."""
     zero = np.zeros_like(t)
     angles = {
@@ -59,10 +59,10 @@ def stand(style: Style, t: Array) -> Scene:
         for side, sign in (("l", 1), ("r", -1))
     }
     sway = np.stack([style.noise(t, 0.008), style.noise(t, 0.0015) - style.between(0.010, 0.017), style.noise(t, 0.008)], 1)
-    return Scene(angles, sway, feet)
+    return Exercise(angles, sway, feet)
 
 
-def add(scene: Scene, **angles: Array | float) -> None:
-    """Add degrees, a number or one a frame, to angles of the scene."""
+def add(exercise: Exercise, **angles: Array | float) -> None:
+    """Add degrees, a number or one a frame, to angles of the exercise."""
     for name, value in angles.items():
-        scene.angles[name] = scene.angles.get(name, 0.0) + value
+        exercise.angles[name] = exercise.angles.get(name, 0.0) + value

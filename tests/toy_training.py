@@ -14,7 +14,7 @@ from snarfcli.samples.preprocessing import preprocess_subject
 from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import SamplingSettings
 from snarfcli.shape import ConditionConfig, ShapeConfig
-from snarfcli.training.extent import rough_canonical_points
+from snarfcli.training.rough_shape import rough_canonical_points
 from snarfcli.training.settings import TrainingConfig
 
 

@@ -18,7 +18,7 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import evaluate
-from snarfcli.evaluation.report import SPLITS, Evaluation, metrics_content, table, timings_text
+from snarfcli.evaluation.report import SPLITS, EvaluationReport, metrics_content, table, timings_text
 from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
 from snarfcli.files import write_json
@@ -116,7 +116,7 @@ def run(config: EvalConfig) -> None:
         seed=config.seed,
         desc=f"eval {config.subject} {config.split}",
     )
-    evaluation = Evaluation(
+    evaluation = EvaluationReport(
         data=store.data,
         subject=store.subject,
         model=avatar.config.model.name,

@@ -31,9 +31,9 @@ from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.samples.store import SampleStore, samples_folder
 from snarfcli.shape import CONDITIONS, ConditionConfig, ShapeConfig
-from snarfcli.training.extent import rough_canonical_points
 from snarfcli.training.loop import train
 from snarfcli.training.losses import JOINT_TARGETS
+from snarfcli.training.rough_shape import rough_canonical_points
 from snarfcli.training.settings import TrainingConfig
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Diverged, Trainer
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from snarfcli.evaluation.metrics import FrameMetrics, Summary, group_by_sequence, mean_of_sequences, summarise
 
-__all__ = ["PROTOCOL", "REFERENCE_POINTS", "SPLITS", "Evaluation", "metrics_content", "plain", "table", "timings_text"]
+__all__ = ["PROTOCOL", "REFERENCE_POINTS", "SPLITS", "EvaluationReport", "metrics_content", "plain", "table", "timings_text"]
 
 SPLITS = {"id": "in distribution", "ood": "out of distribution"}
 """What can be evaluated: held-out motion of the training's kind, and poses unlike it."""
@@ -37,7 +37,7 @@ _NAME_WIDTH = 30  # longer names of sequences are cut, so that the table fits 10
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class EvaluationReport:
     """The measured frames of one avatar on one split, and where they came from."""
 
     data: str
@@ -69,7 +69,7 @@ class Evaluation:
         return f"{self.model} of subject {self.subject}, data {self.data}, {SPLITS[self.split]} ({self.split})"
 
 
-def table(evaluation: Evaluation) -> str:
+def table(evaluation: EvaluationReport) -> str:
     """Return the table of an evaluation: a row for each sequence, then the means, IoU and shares in percent."""
     groups = {name: summarise(frames) for name, frames in group_by_sequence(evaluation.frames).items()}
     overall = summarise(evaluation.frames)
@@ -101,7 +101,7 @@ def _row(name: str, summary: Summary, width: int) -> str:
     )
 
 
-def timings_text(evaluation: Evaluation) -> str:
+def timings_text(evaluation: EvaluationReport) -> str:
     """Return two lines: the times for as many points as in the papers' table, and where and how long it ran."""
     times = _timings(evaluation)
     machine = evaluation.machine["machine"]
@@ -118,7 +118,7 @@ def _counted(count: int, what: str) -> str:
     return f"{count} {what}" + ("" if count == 1 else "s")
 
 
-def _timings(evaluation: Evaluation) -> dict[str, Any]:
+def _timings(evaluation: EvaluationReport) -> dict[str, Any]:
     summary = summarise(evaluation.frames)
     scale = 1000 * REFERENCE_POINTS / max(summary.points, 1)
     seconds = {"search": summary.search_s, "shape": summary.shape_s, "total": summary.total_s}
@@ -132,7 +132,7 @@ def _timings(evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def metrics_content(evaluation: Evaluation, settings: Mapping[str, Any]) -> dict[str, Any]:
+def metrics_content(evaluation: EvaluationReport, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return what `metrics.json` holds, as plain JSON values; IoU and shares from 0 to 1, times in seconds unless named.
 
     Args:

@@ -116,7 +116,7 @@ class BrokenFrame:
     """One line: which mesh, what is wrong, what to do."""
 
 
-class Meshes(Protocol):
+class MeshSequence(Protocol):
     """Posed meshes: vertices [V, 3], metres, and outward faces [F, 3]."""
 
     def __len__(self) -> int: ...
@@ -313,7 +313,7 @@ def sample_frame(
 
 
 def sample_frames(
-    meshes: Meshes, settings: SamplingSettings, names: Sequence[str], frames: Sequence[int]
+    meshes: MeshSequence, settings: SamplingSettings, names: Sequence[str], frames: Sequence[int]
 ) -> Iterator[FrameSamples | BrokenFrame]:
     """Sample one posed mesh after another; the random numbers of each depend on its own names and frame number.
 
@@ -340,7 +340,7 @@ def sample_frames(
         yield samples
 
 
-def check_frames(meshes: Meshes, inside_test: str, sequence: str, frames: Sequence[int]) -> Iterator[BrokenFrame | None]:
+def check_frames(meshes: MeshSequence, inside_test: str, sequence: str, frames: Sequence[int]) -> Iterator[BrokenFrame | None]:
     """Read one posed mesh after another, and yield None for each that can be used, or what is wrong with the first that cannot.
 
     Args:
@@ -354,7 +354,7 @@ def check_frames(meshes: Meshes, inside_test: str, sequence: str, frames: Sequen
 
 
 def _checked_meshes(
-    meshes: Meshes, inside_test: str, sequence: str, frames: Sequence[int]
+    meshes: MeshSequence, inside_test: str, sequence: str, frames: Sequence[int]
 ) -> Iterator[tuple[tuple[np.ndarray, np.ndarray, int] | BrokenFrame, str]]:
     """Yield vertices, faces and number of boundary edges of each mesh, and what to call it, until one is broken."""
     checked: np.ndarray | None = None

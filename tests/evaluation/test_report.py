@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from snarfcli.evaluation.metrics import FrameMetrics
-from snarfcli.evaluation.report import Evaluation, metrics_content, plain, table, timings_text
+from snarfcli.evaluation.report import EvaluationReport, metrics_content, plain, table, timings_text
 from snarfcli.files import write_json
 
 FRAME = FrameMetrics("walk", 0, 0, 0.9625, 0.87, 0.955, 1000, 900, 200, 400, 100, 1, 0.001, 0.004, 0.006)
@@ -20,7 +20,7 @@ FRAMES = [
     replace(FRAME, sequence="handstand", iou_bbox=1.0, iou_surface=1.0, without=0, inside_without=0),
 ]
 MACHINE = {"versions": {"snarf": "1.2.3", "torch": "2.9"}, "machine": {"processor": "abacus", "threads": 2}}
-EVALUATION = Evaluation(
+EVALUATION = EvaluationReport(
     data="builtin",
     subject="50002",
     model="fast_snarf",

@@ -21,7 +21,7 @@ from snarfcli.models.smpl_nn import nearest_vertex
 from snarfcli.models.system import MeshTemplate
 from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.shape import ConditionConfig
-from snarfcli.training.extent import rough_canonical_points
+from snarfcli.training.rough_shape import rough_canonical_points
 from snarfcli.training.trainer import Trainer
 
 CPU = torch.device("cpu")

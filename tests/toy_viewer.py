@@ -6,25 +6,25 @@ import threading
 
 from toy_avatar import ToyAvatar
 
-from snarfcli.viewer.body import Body
-from snarfcli.viewer.picture import Look, Picture
-from snarfcli.viewer.state import Viewing
+from snarfcli.viewer.body import ViewerBody
+from snarfcli.viewer.picture import Picture, ViewerLook
+from snarfcli.viewer.state import ViewerState
 
 PATIENCE = 60  # seconds; nothing waits that long unless something is wrong
-SMALL = Look(skinned_resolution=24, field_resolution=24)
+SMALL = ViewerLook(skinned_resolution=24, field_resolution=24)
 
 
 class Watched:
     """What a page would do: look at the picture whenever it is woken."""
 
-    def __init__(self, avatar: ToyAvatar | None = None, look: Look = SMALL) -> None:
+    def __init__(self, avatar: ToyAvatar | None = None, look: ViewerLook = SMALL) -> None:
         self.now = 0.0
         self.woken = threading.Event()
         self.avatar = avatar or ToyAvatar()
-        self.viewing = Viewing(Body(self.avatar), look, self.woken.set, lambda: self.now)
+        self.state = ViewerState(ViewerBody(self.avatar), look, self.woken.set, lambda: self.now)
 
     def picture(self) -> Picture:
-        return self.viewing.picture()[0]
+        return self.state.picture()[0]
 
     def settled(self) -> Picture:
         """Return the picture once nothing more is being made."""

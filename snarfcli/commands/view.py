@@ -20,7 +20,7 @@ from snarfcli.export.rig import unique_names
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL, layout_of
 from snarfcli.samples.store import SampleStore
-from snarfcli.viewer.picture import SURFACE_NAMES, Look
+from snarfcli.viewer.picture import SURFACE_NAMES, ViewerLook
 from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback, require_viser
 
 __all__ = ["ViewConfig", "run", "start"]
@@ -82,7 +82,7 @@ def start(config: ViewConfig) -> ViewServer:
     if not avatar.has_skinning_weights and (config.weight_colors or config.surface == "skinned"):
         log.info("model %s has no skinning weights: only its field is shown", avatar.config.model.name)
     shelf = _Shelf(config, avatar)
-    look = Look(
+    look = ViewerLook(
         surface=config.surface,
         skinned_resolution=config.resolution,
         field_resolution=config.resolution,
@@ -111,7 +111,7 @@ def _check(config: ViewConfig) -> int:
     if text == "auto":
         return 0
     if not (text.isascii() and text.isdecimal() and int(text) < 65536):
-        raise UserError(f"port must be a number from 1 to 65535, or auto for any free one, got '{config.port}'")
+        raise UserError(f"port: wanted a number from 1 to 65535, or auto for any free one, got '{config.port}'")
     return int(text)
 
 

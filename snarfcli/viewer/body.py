@@ -15,14 +15,14 @@ from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.meshing.surfaces import field_surface
 
 __all__ = [
-    "Body",
-    "CanonicalMade",
-    "FieldMade",
-    "MakeCanonical",
-    "MakeField",
-    "MakeShape",
+    "CanonicalRequest",
+    "CanonicalResult",
+    "FieldRequest",
+    "FieldResult",
     "Posed",
-    "ShapeMade",
+    "ShapeRequest",
+    "ShapeResult",
+    "ViewerBody",
 ]
 
 Floats = NDArray[np.float32]
@@ -43,7 +43,7 @@ class Posed:
 
 
 @dataclass(frozen=True, eq=False)
-class MakeCanonical:
+class CanonicalRequest:
     """Ask for the canonical surface."""
 
     resolution: int
@@ -51,7 +51,7 @@ class MakeCanonical:
 
 
 @dataclass(frozen=True, eq=False)
-class CanonicalMade:
+class CanonicalResult:
     """The canonical surface, which every pose is made from."""
 
     resolution: int
@@ -60,26 +60,26 @@ class CanonicalMade:
 
 
 @dataclass(frozen=True, eq=False)
-class MakeShape:
+class ShapeRequest:
     """Ask how the canonical shape is in one pose."""
 
     posed: Posed
-    canonical: CanonicalMade
+    canonical: CanonicalResult
 
 
 @dataclass(frozen=True, eq=False)
-class ShapeMade:
+class ShapeResult:
     """The canonical shape in one pose."""
 
     posed: Posed
-    canonical: CanonicalMade
+    canonical: CanonicalResult
     vertices_c: Floats
     """[V, 3] canonical, metres."""
     seconds: float
 
 
 @dataclass(frozen=True, eq=False)
-class MakeField:
+class FieldRequest:
     """Ask for the surface of the field in one pose."""
 
     posed: Posed
@@ -90,7 +90,7 @@ class MakeField:
 
 
 @dataclass(frozen=True, eq=False)
-class FieldMade:
+class FieldResult:
     """The surface of the field in one pose."""
 
     posed: Posed
@@ -99,7 +99,7 @@ class FieldMade:
     seconds: float
 
 
-class Body:
+class ViewerBody:
     """An avatar, asked for surfaces.
 
     Args:
@@ -116,20 +116,20 @@ class Body:
         pose_t = torch.from_numpy(pose).float()[None]
         return self.avatar.bone_transforms(pose_t, torch.from_numpy(translation).float()[None])[0].cpu().numpy()
 
-    def make(self, request: MakeCanonical | MakeShape | MakeField) -> CanonicalMade | ShapeMade | FieldMade:
+    def make(self, request: CanonicalRequest | ShapeRequest | FieldRequest) -> CanonicalResult | ShapeResult | FieldResult:
         """Make what was asked for, which may take seconds.
 
         Raises:
             EmptySurface, FullSurface: there is no surface in this pose.
         """
         start = time.perf_counter()
-        if isinstance(request, MakeCanonical):
+        if isinstance(request, CanonicalRequest):
             surface = SkinnedSurface(self.avatar, request.resolution)
-            return CanonicalMade(request.resolution, surface, time.perf_counter() - start)
+            return CanonicalResult(request.resolution, surface, time.perf_counter() - start)
         pose = torch.from_numpy(request.posed.pose).float()
-        if isinstance(request, MakeShape):
+        if isinstance(request, ShapeRequest):
             vertices_c = request.canonical.surface.canonical_vertices(pose)
-            return ShapeMade(request.posed, request.canonical, vertices_c, time.perf_counter() - start)
+            return ShapeResult(request.posed, request.canonical, vertices_c, time.perf_counter() - start)
         mesh = field_surface(
             self.avatar,
             pose,
@@ -137,4 +137,4 @@ class Body:
             weights_from=request.weights_from,
             transforms=torch.from_numpy(request.posed.transforms),
         )
-        return FieldMade(request.posed, request.resolution, mesh, time.perf_counter() - start)
+        return FieldResult(request.posed, request.resolution, mesh, time.perf_counter() - start)

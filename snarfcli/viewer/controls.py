@@ -10,8 +10,8 @@ from snarfcli.viewer.look_tab import LookTab
 from snarfcli.viewer.motion_tab import MotionTab
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.pose_tab import PoseTab
-from snarfcli.viewer.scene import Scene
-from snarfcli.viewer.state import Viewing
+from snarfcli.viewer.scene import ViewerScene
+from snarfcli.viewer.state import ViewerState
 
 __all__ = ["Controls"]
 
@@ -24,7 +24,7 @@ class Controls:
 
     Args:
         server: viser's.
-        viewing: what is shown.
+        state: what is shown.
         scene: where it is shown.
         motions: names of the motions that can be played.
         load_motion: returns the motion of a name and its bone transforms; raises UserError.
@@ -36,8 +36,8 @@ class Controls:
     def __init__(
         self,
         server: Any,
-        viewing: Viewing,
-        scene: Scene,
+        state: ViewerState,
+        scene: ViewerScene,
         motions: Sequence[str],
         load_motion: Callable[[str], tuple[Any, Any]],
         facts: Mapping[str, str],
@@ -55,11 +55,11 @@ class Controls:
         self._text = gui.add_markdown("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Motion"):
-            self.motion = MotionTab(gui, viewing, motions, load_motion, first_motion)
+            self.motion = MotionTab(gui, state, motions, load_motion, first_motion)
         with tabs.add_tab("Pose"):
-            self.pose = PoseTab(gui, viewing, scene)
+            self.pose = PoseTab(gui, state, scene)
         with tabs.add_tab("Look"):
-            LookTab(gui, viewing, scene)
+            LookTab(gui, state, scene)
         with tabs.add_tab("About"):
             rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
             gui.add_markdown(f"| | |\n|---|---|\n{rows}")

@@ -7,8 +7,8 @@ from typing import Any
 
 from snarfcli.viewer.inputs import on_user
 from snarfcli.viewer.picture import RESOLUTIONS, SURFACE_NAMES
-from snarfcli.viewer.scene import Scene
-from snarfcli.viewer.state import Viewing
+from snarfcli.viewer.scene import ViewerScene
+from snarfcli.viewer.state import ViewerState
 
 __all__ = ["LookTab"]
 
@@ -18,13 +18,13 @@ class LookTab:
 
     Args:
         gui: viser's.
-        viewing: what is shown.
+        state: what is shown.
         scene: where it is shown.
     """
 
-    def __init__(self, gui: Any, viewing: Viewing, scene: Scene) -> None:
-        look = viewing.look
-        has_weights = viewing.body.has_weights
+    def __init__(self, gui: Any, state: ViewerState, scene: ViewerScene) -> None:
+        look = state.look
+        has_weights = state.body.has_weights
         surfaces = SURFACE_NAMES if has_weights else ("field",)
         surface = gui.add_dropdown(
             "Surface", surfaces, initial_value=look.surface, hint="skinned: at once; field: exact where the body meets itself"
@@ -46,22 +46,22 @@ class LookTab:
             box.visible = has_weights
 
         def change(name: str, convert: Callable[[Any], Any] = lambda value: value) -> Callable[[Any, Any], None]:
-            return lambda handle, client: viewing.change_look(**{name: convert(handle.value)})
+            return lambda handle, client: state.change_look(**{name: convert(handle.value)})
 
         def change_surface(handle: Any, client: Any) -> None:
             self._show_resolution(handle.value)
-            viewing.change_look(surface=handle.value)
+            state.change_look(surface=handle.value)
 
         def change_handle(handle: Any, client: Any) -> None:
             scene.shows_handle = handle.value
             if handle.value and not skeleton.value:
                 skeleton.value = True
-            viewing.change_look(shows_skeleton=skeleton.value)
+            state.change_look(shows_skeleton=skeleton.value)
 
         def change_scene(name: str) -> Callable[[Any, Any], None]:
             def change_it(handle: Any, client: Any) -> None:
                 setattr(scene, name, handle.value)
-                viewing.change_look()
+                state.change_look()
 
             return change_it
 

@@ -8,7 +8,7 @@ from typing import Any
 from snarfcli.errors import UserError
 from snarfcli.viewer.inputs import on_user
 from snarfcli.viewer.picture import Picture
-from snarfcli.viewer.state import Viewing
+from snarfcli.viewer.state import ViewerState
 
 __all__ = ["NO_MOTION", "MotionTab"]
 
@@ -21,7 +21,7 @@ class MotionTab:
 
     Args:
         gui: viser's.
-        viewing: what is shown.
+        state: what is shown.
         motions: names of the motions that can be played.
         load_motion: returns the motion of a name and its bone transforms; raises UserError.
         first: name of the motion that is loaded already.
@@ -30,12 +30,12 @@ class MotionTab:
     def __init__(
         self,
         gui: Any,
-        viewing: Viewing,
+        state: ViewerState,
         motions: Sequence[str],
         load_motion: Callable[[str], tuple[Any, Any]],
         first: str | None = None,
     ) -> None:
-        self._viewing = viewing
+        self._state = state
         self._load_motion = load_motion
         self._is_playing: bool | None = None
         self.notice: str | None = None
@@ -44,16 +44,16 @@ class MotionTab:
         self._play = gui.add_button("Play", icon="player-play")
         self._frame = gui.add_slider("Frame", 0, 1, 1, 0)
         speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="times the motion's own pace")
-        loop = gui.add_checkbox("Loop", viewing.player.is_looping)
+        loop = gui.add_checkbox("Loop", state.player.is_looping)
         in_place = gui.add_checkbox(
-            "Stay in place", viewing.look.is_in_place, hint="the body keeps its height, but does not travel"
+            "Stay in place", state.look.is_in_place, hint="the body keeps its height, but does not travel"
         )
         on_user(self.names, lambda handle, client: self.choose(handle.value))
         self._play.on_click(lambda event: self._play_or_pause())
         on_user(self._frame, lambda handle, client: self._seek(handle.value))
-        on_user(speed, lambda handle, client: viewing.change_speed(handle.value))
-        on_user(loop, lambda handle, client: viewing.change_looping(handle.value))
-        on_user(in_place, lambda handle, client: viewing.change_look(is_in_place=handle.value))
+        on_user(speed, lambda handle, client: state.change_speed(handle.value))
+        on_user(loop, lambda handle, client: state.change_looping(handle.value))
+        on_user(in_place, lambda handle, client: state.change_look(is_in_place=handle.value))
         self._fit_frames()
 
     def choose(self, name: str) -> None:
@@ -64,9 +64,9 @@ class MotionTab:
         except UserError as error:
             self.notice = " ".join(str(error).split())
             motion, transforms = None, None
-        self._viewing.load_motion(motion, transforms)
+        self._state.load_motion(motion, transforms)
         self._fit_frames()
-        self._viewing.play()
+        self._state.play()
 
     def follow(self, picture: Picture) -> None:
         """Say on the button what it does."""
@@ -77,23 +77,23 @@ class MotionTab:
 
     def show_frame(self, frame: int) -> None:
         """Set the slider to the number of a frame."""
-        if self._viewing.motion is not None:
+        if self._state.motion is not None:
             self._frame.value = min(frame, int(self._frame.max))
 
     def _fit_frames(self) -> None:
         """Give the frame's slider the length of the motion."""
-        count = self._viewing.player.num_frames
+        count = self._state.player.num_frames
         self._frame.value = 0
         self._frame.max = max(count - 1, 1)
         self._frame.disabled = self._play.disabled = count < 2
 
     def _play_or_pause(self) -> None:
-        if self._viewing.player.is_playing:
-            self._viewing.pause()
+        if self._state.player.is_playing:
+            self._state.pause()
         else:
-            self._viewing.play()
+            self._state.play()
 
     def _seek(self, frame: int) -> None:
-        if self._viewing.motion is not None:
-            self._viewing.pause()
-            self._viewing.seek(int(frame))
+        if self._state.motion is not None:
+            self._state.pause()
+            self._state.seek(int(frame))

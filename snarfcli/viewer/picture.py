@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.viewer.body import Posed
 
-__all__ = ["RESOLUTIONS", "SURFACE_NAMES", "Look", "Picture", "ShownMesh"]
+__all__ = ["RESOLUTIONS", "SURFACE_NAMES", "Picture", "ShownMesh", "ViewerLook"]
 
 RESOLUTIONS = (48, 64, 96, 128, 192, 256, 384, 512)
 SURFACE_NAMES = ("skinned", "field")
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewerLook:
     """How the avatar is shown."""
 
     surface: str = "skinned"
@@ -60,7 +60,7 @@ class ShownMesh:
 class Picture:
     """All that is to be seen at one moment."""
 
-    look: Look
+    look: ViewerLook
     """How it is to be shown: the look that the rest was made for, while the one that is wanted may have changed since."""
     floor_y: float
     """Height of the floor, metres."""

@@ -10,8 +10,8 @@ import numpy as np
 from snarfcli.viewer.inputs import AngleSliders, on_user, rounded
 from snarfcli.viewer.joints import joint_labels, pose_file
 from snarfcli.viewer.picture import Picture
-from snarfcli.viewer.scene import Scene
-from snarfcli.viewer.state import Viewing
+from snarfcli.viewer.scene import ViewerScene
+from snarfcli.viewer.state import ViewerState
 
 __all__ = ["PoseTab"]
 
@@ -23,15 +23,15 @@ class PoseTab:
 
     Args:
         gui: viser's.
-        viewing: what is shown.
+        state: what is shown.
         scene: where it is shown, and the chosen joint is marked.
     """
 
-    def __init__(self, gui: Any, viewing: Viewing, scene: Scene) -> None:
+    def __init__(self, gui: Any, state: ViewerState, scene: ViewerScene) -> None:
         self._gui = gui
-        self._viewing = viewing
+        self._state = state
         self._scene = scene
-        self._labels = joint_labels(viewing.body.skeleton)
+        self._labels = joint_labels(state.body.skeleton)
         self._seen_pose = -1  # which pose the sliders stand for
         with gui.add_folder("Joint", visible=bool(self._labels)):  # a skeleton of one joint has its root only
             joints = tuple(self._labels) or ("none",)
@@ -44,9 +44,9 @@ class PoseTab:
         reset = gui.add_button("Reset pose", icon="refresh")
         save = gui.add_button("Save pose", icon="download", hint="as .npz, which --pose reads again")
         on_user(self._joint, lambda handle, client: self._mark_joint())
-        on_user(self._height, lambda handle, client: viewing.move_root(1, handle.value))
+        on_user(self._height, lambda handle, client: state.move_root(1, handle.value))
         buttons.on_click(lambda event: self._press(event.target.value))
-        reset.on_click(lambda event: viewing.reset_pose())
+        reset.on_click(lambda event: state.reset_pose())
         save.on_click(lambda event: self._save(event.client))
         self._mark_joint()
 
@@ -73,23 +73,21 @@ class PoseTab:
         return True
 
     def _add_angles(self, joint: Callable[[], int]) -> AngleSliders:
-        viewing = self._viewing
-        return AngleSliders(
-            self._gui, lambda: viewing.pause().pose[joint()], lambda vector: viewing.turn_joint(joint(), vector)
-        )
+        state = self._state
+        return AngleSliders(self._gui, lambda: state.pause().pose[joint()], lambda vector: state.turn_joint(joint(), vector))
 
     def _mark_joint(self) -> None:
         self._scene.chosen_joint = self.joint
         self._seen_pose = -1
-        self._viewing.change_look()
+        self._state.change_look()
 
     def _press(self, button: str) -> None:
         if button == "Mirror":
-            self._viewing.mirror_joint(self.joint)
+            self._state.mirror_joint(self.joint)
         else:
-            self._viewing.turn_joint(self.joint, np.zeros(3))
+            self._state.turn_joint(self.joint, np.zeros(3))
 
     def _save(self, client: Any) -> None:
         if client is not None:
-            posed = self._viewing.posed
+            posed = self._state.posed
             client.send_file_download("pose.npz", pose_file(posed.pose, posed.translation), save_immediately=True)

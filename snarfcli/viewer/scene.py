@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from snarfcli.viewer.body import Posed
 from snarfcli.viewer.joints import global_turns, posed_joints, vector_from_turn
 from snarfcli.viewer.picture import Picture
-from snarfcli.viewer.state import Viewing
+from snarfcli.viewer.state import ViewerState
 from snarfcli.viewer.surfaces import ShownSurface
 
-__all__ = ["BODY_COLOR", "Scene"]
+__all__ = ["BODY_COLOR", "ViewerScene"]
 
 BODY_COLOR = (205, 184, 168)
 """Of the body, sRGB: clay, on which light and shade are seen well."""
@@ -27,22 +27,22 @@ _ROOM, _ROOM_ASIDE = 0.74, 0.46  # half the height of the picture over the size 
 _PANEL = 0.3  # how far the middle is shifted for the panel, which covers the right side
 
 
-class Scene:
+class ViewerScene:
     """The stage that all who look see.
 
     Args:
         server: viser's.
-        viewing: what is shown.
+        state: what is shown.
         choose_joint: called with the number of a joint that somebody clicked.
         clock: seconds.
     """
 
     def __init__(
-        self, server: Any, viewing: Viewing, choose_joint: Callable[[int], None], clock: Callable[[], float] = time.monotonic
+        self, server: Any, state: ViewerState, choose_joint: Callable[[int], None], clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._server = server
-        self._viewing = viewing
-        self._skeleton = viewing.body.skeleton
+        self._state = state
+        self._skeleton = state.body.skeleton
         self._choose_joint = choose_joint
         self._clock = clock
         self.body_color = BODY_COLOR
@@ -52,7 +52,7 @@ class Scene:
         self._shown: tuple | None = None
         self._picture: Picture | None = None
         self._turning: set[int | None] = set()  # numbers of the clients that hold the handle
-        rest = viewing.body.transforms(np.zeros((self._skeleton.num_joints, 3)), np.zeros(3))
+        rest = state.body.transforms(np.zeros((self._skeleton.num_joints, 3)), np.zeros(3))
         joints = posed_joints(self._skeleton, rest)
         self.size = float(max(np.ptp(joints, axis=0).max(), 0.1))
         self._aside = float(1.15 * max(np.ptp(joints[:, 0]), 0.6 * self.size))
@@ -75,7 +75,7 @@ class Scene:
 
     def frame_body(self, camera: Any) -> None:
         """Put a camera so that it sees the body, and the canonical shape beside it."""
-        position, look_at = self._camera(self._viewing.look.shows_canonical)
+        position, look_at = self._camera(self._state.look.shows_canonical)
         camera.up_direction, camera.position, camera.look_at = (0.0, 1.0, 0.0), position, look_at
 
     def show(self, picture: Picture) -> None:
@@ -166,8 +166,8 @@ class Scene:
         """Turn the chosen joint as a client turned the handle, a quaternion; the handle is theirs until that is over."""
         (self._turning.discard if is_over else self._turning.add)(client_id)
         turn = Rotation.from_quat(np.asarray(wxyz)[[1, 2, 3, 0]])
-        vector = vector_from_turn(self._skeleton, self._viewing.pause().transforms, self.chosen_joint, turn)
-        self._viewing.turn_joint(self.chosen_joint, vector)
+        vector = vector_from_turn(self._skeleton, self._state.pause().transforms, self.chosen_joint, turn)
+        self._state.turn_joint(self.chosen_joint, vector)
 
     def let_go(self, client_id: int) -> None:
         """Take the handle back from a client who left, maybe in the middle of a turn."""
@@ -179,8 +179,8 @@ class Scene:
 
     def _camera(self, shows_canonical: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return where a camera stands and looks at, metres: in front of the body, somewhat to its left."""
-        joints = posed_joints(self._skeleton, self._viewing.posed.transforms)
-        floor_y, half = self._viewing.floor_y, self.size / 2
+        joints = posed_joints(self._skeleton, self._state.posed.transforms)
+        floor_y, half = self._state.floor_y, self.size / 2
         middle = np.array([joints[:, 0].mean(), floor_y + 1.12 * half, joints[:, 2].mean()])
         low, high = middle - half, middle + half
         if shows_canonical:

@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from snarfcli.errors import UserError
-from snarfcli.viewer.body import Body
+from snarfcli.viewer.body import ViewerBody
 from snarfcli.viewer.controls import Controls
-from snarfcli.viewer.picture import Look
-from snarfcli.viewer.scene import Scene
-from snarfcli.viewer.state import Viewing
+from snarfcli.viewer.picture import ViewerLook
+from snarfcli.viewer.scene import ViewerScene
+from snarfcli.viewer.state import ViewerState
 
 __all__ = ["ViewServer", "can_open_browser", "check_port", "is_loopback", "require_viser"]
 
@@ -113,7 +113,7 @@ class ViewServer:
     def __init__(
         self,
         avatar: Any,
-        look: Look,
+        look: ViewerLook,
         *,
         host: str = "127.0.0.1",
         port: int = 0,
@@ -124,12 +124,12 @@ class ViewServer:
     ) -> None:
         require_viser()
         check_port(host, port)
-        import viser  # noqa: F401
+        import viser
 
         self._woken = threading.Event()
         self._is_stopped = False
         self._is_ready = False  # whether there is something to see
-        self.viewing = Viewing(Body(avatar), look, self._woken.set)
+        self.state = ViewerState(ViewerBody(avatar), look, self._woken.set)
         with _silence():
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.port: int = self.server.get_port()
@@ -137,11 +137,11 @@ class ViewServer:
             self._stop_server()
             raise UserError(f"port {port} is in use; port {self.port} is free: give --port {self.port}")
         if first_motion is not None:
-            self.viewing.load_motion(*first_motion[1:])
-        self.scene = Scene(self.server, self.viewing, lambda joint: self.controls.pose.choose_joint(joint))
+            self.state.load_motion(*first_motion[1:])
+        self.scene = ViewerScene(self.server, self.state, lambda joint: self.controls.pose.choose_joint(joint))
         self.controls = Controls(
             self.server,
-            self.viewing,
+            self.state,
             self.scene,
             motions,
             load_motion or _no_motion,
@@ -149,7 +149,7 @@ class ViewServer:
             first_motion[0] if first_motion else None,
         )
         if first_motion is not None:
-            self.viewing.play()
+            self.state.play()
         self.server.on_client_connect(lambda client: self._woken.set())
         self.server.on_client_disconnect(lambda client: self._part(client.client_id))
         self._thread = threading.Thread(target=self._run, name="snarf-view", daemon=True)
@@ -160,7 +160,7 @@ class ViewServer:
         self._is_stopped = True
         self._woken.set()
         self._thread.join(timeout=10)
-        self.viewing.stop()
+        self.state.stop()
         self._stop_server()
 
     def _part(self, client_id: int) -> None:
@@ -199,7 +199,7 @@ class ViewServer:
 
     def _step(self) -> list[float | None]:
         """Show the present picture; return for how many seconds each part is content."""
-        picture, frame_wait = self.viewing.picture()
+        picture, frame_wait = self.state.picture()
         self._is_ready = picture.mesh is not None or picture.message is not None
         self.scene.show(picture)
         return [frame_wait, self.scene.advance(), self.controls.follow(picture)]

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.viewer.body import Body, MakeShape, Posed
+from snarfcli.viewer.body import Posed, ShapeRequest, ViewerBody
 from snarfcli.viewer.joints import mirrored_joint
-from snarfcli.viewer.picture import Look, Picture
+from snarfcli.viewer.picture import Picture, ViewerLook
 from snarfcli.viewer.player import Player
-from snarfcli.viewer.surface_cache import MadeSurfaces
-from snarfcli.viewer.worker import Worker
+from snarfcli.viewer.surface_cache import SurfaceCache
+from snarfcli.viewer.worker import BackgroundWorker
 
-__all__ = ["Viewing"]
+__all__ = ["ViewerState"]
 
 _SHAPE_EVERY_S = 0.1  # while playing
 _FLOOR_FRAMES = 40  # of a motion, looked at to find its floor
 
 
-class Viewing:
+class ViewerState:
     """What was chosen on the page, by whoever looks at it: everybody sees and changes the same.
 
     Changes may come from any thread. One thread calls `picture` whenever `wake` was called or the time it was told is over.
@@ -36,7 +36,9 @@ class Viewing:
         clock: seconds.
     """
 
-    def __init__(self, body: Body, look: Look, wake: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, body: ViewerBody, look: ViewerLook, wake: Callable[[], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.body = body
         self.look = look if body.has_weights else replace(look, surface="field", weight_colors=False, shows_canonical=False)
         self.player = Player()
@@ -48,10 +50,10 @@ class Viewing:
         self._wake = wake
         self._clock = clock
         self._lock = threading.RLock()
-        self._worker = Worker(body.make, wake)
+        self._worker = BackgroundWorker(body.make, wake)
         self._frame = 0
         self._next_shape = 0.0
-        self._made = MadeSurfaces(body)
+        self._surfaces = SurfaceCache(body)
         zeros = np.zeros((body.skeleton.num_joints, 3))
         self._posed = Posed(0, zeros, np.zeros(3), body.transforms(zeros, np.zeros(3)))
         self._find_floor()
@@ -163,25 +165,25 @@ class Viewing:
             if self.motion is not None and frame != self._frame:
                 self._go_to(frame)
             outcome = self._worker.take()
-            if outcome is not None and self._made.keep(*outcome):  # now it is known how far down the feet reach
+            if outcome is not None and self._surfaces.keep(*outcome):  # now it is known how far down the feet reach
                 self._find_floor()
             posed, look = self._posed, self.look
-            requests = self._made.wanted(posed, look)
+            requests = self._surfaces.wanted(posed, look)
             # the shape changes slowly: while playing, leave the processor to the browser in between
             may_shape = not self.player.is_playing or now >= self._next_shape
-            due = next((request for request in requests if may_shape or not isinstance(request, MakeShape)), None)
-            if due is not None and self._worker.start(due) and isinstance(due, MakeShape):
+            due = next((request for request in requests if may_shape or not isinstance(request, ShapeRequest)), None)
+            if due is not None and self._worker.start(due) and isinstance(due, ShapeRequest):
                 self._next_shape = now + _SHAPE_EVERY_S
             picture = Picture(
                 look,
                 self.floor_y,
                 posed,
-                self._made.shown(posed, look, self.player.is_playing),
-                self._made.canonical(look) if look.shows_canonical else None,
+                self._surfaces.shown(posed, look, self.player.is_playing),
+                self._surfaces.canonical(look) if look.shows_canonical else None,
                 self._frame,
                 self.player.is_playing,
                 bool(requests),
-                self._made.problem,
+                self._surfaces.problem,
             )
             return picture, self.player.seconds_to_next(now)
 
@@ -222,7 +224,7 @@ class Viewing:
 
     def _stand(self) -> None:
         """Put the body onto the floor by its height."""
-        low = self._made.lowest(self._posed.transforms)
+        low = self._surfaces.lowest(self._posed.transforms)
         translation = np.add(self._posed.translation, (0.0, self.floor_y - low, 0.0))
         self._take(self._posed.pose, translation)
 
@@ -230,11 +232,11 @@ class Viewing:
         """Put the floor below the lowest point of the motion; without one, below the body in its rest pose."""
         if self.motion is None:
             zeros = np.zeros_like(self._posed.pose)
-            self.floor_y = self._made.lowest(self.body.transforms(zeros, np.zeros(3)))
+            self.floor_y = self._surfaces.lowest(self.body.transforms(zeros, np.zeros(3)))
             return
         frames = np.unique(np.linspace(0, self.motion.num_frames - 1, _FLOOR_FRAMES).astype(int))
         lowest = []
         for frame in frames:
             pose, translation, transforms = self._of_frame(frame)
-            lowest.append(self._made.lowest(self.body.transforms(pose, translation) if transforms is None else transforms))
+            lowest.append(self._surfaces.lowest(self.body.transforms(pose, translation) if transforms is None else transforms))
         self.floor_y = min(lowest)

@@ -13,19 +13,19 @@ from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.viewer.body import (
-    Body,
-    CanonicalMade,
-    FieldMade,
-    MakeCanonical,
-    MakeField,
-    MakeShape,
+    CanonicalRequest,
+    CanonicalResult,
+    FieldRequest,
+    FieldResult,
     Posed,
-    ShapeMade,
+    ShapeRequest,
+    ShapeResult,
+    ViewerBody,
 )
 from snarfcli.viewer.joints import posed_joints
-from snarfcli.viewer.picture import Look, ShownMesh
+from snarfcli.viewer.picture import ShownMesh, ViewerLook
 
-__all__ = ["MadeSurfaces"]
+__all__ = ["SurfaceCache"]
 
 log = logging.getLogger(__name__)
 
@@ -33,18 +33,18 @@ _BELOW_JOINTS = 0.03  # of the body's size: how far the sole is below the joints
 _POINTS = 3000  # of the body, enough to find its lowest one
 
 
-class MadeSurfaces:
+class SurfaceCache:
     """The latest surface of each kind, and what could not be made.
 
     Args:
         body: who makes them; not here, since that takes long.
     """
 
-    def __init__(self, body: Body) -> None:
+    def __init__(self, body: ViewerBody) -> None:
         self._body = body
-        self._canonical: CanonicalMade | None = None
-        self._shape: ShapeMade | None = None
-        self._field: FieldMade | None = None
+        self._canonical: CanonicalResult | None = None
+        self._shape: ShapeResult | None = None
+        self._field: FieldResult | None = None
         self._latest: type | None = None  # kind of what was done last
         self._failed: dict[tuple, str] = {}  # what could not be made, and why
 
@@ -55,29 +55,29 @@ class MadeSurfaces:
             if not isinstance(error, EmptySurface | FullSurface):
                 log.error("the viewer goes on after: %s: %s", type(error).__name__, error, exc_info=error)
             self._failed[_key(request)] = str(error) or type(error).__name__
-        elif isinstance(made, CanonicalMade):
+        elif isinstance(made, CanonicalResult):
             is_first, self._canonical = self._canonical is None, made
-        elif isinstance(made, ShapeMade):
+        elif isinstance(made, ShapeResult):
             self._shape = made
         else:
             self._field = made
         return is_first
 
-    def wanted(self, posed: Posed, look: Look) -> list[MakeCanonical | MakeShape | MakeField]:
+    def wanted(self, posed: Posed, look: ViewerLook) -> list[CanonicalRequest | ShapeRequest | FieldRequest]:
         """Return what has to be made for a pose and a look, what is more urgent first; empty if all is there, or cannot be."""
-        requests: list[MakeCanonical | MakeShape | MakeField] = []
+        requests: list[CanonicalRequest | ShapeRequest | FieldRequest] = []
         has_canonical = self._canonical is not None and self._canonical.resolution == look.skinned_resolution
         if self._body.has_weights and not has_canonical:
-            requests.append(MakeCanonical(look.skinned_resolution))
+            requests.append(CanonicalRequest(look.skinned_resolution))
         if look.surface == "field" and not self._is_current(posed, look):
             lender = self._canonical.surface.mesh if look.weight_colors and self._canonical else None
-            requests.append(MakeField(posed, look.field_resolution, lender))
+            requests.append(FieldRequest(posed, look.field_resolution, lender))
         if has_canonical and look.has_pose_shape and (look.surface == "skinned" or look.shows_canonical):
             made = self._shape
             if made is None or made.canonical is not self._canonical or made.posed.number != posed.number:
-                requests.append(MakeShape(posed, self._canonical))
-        if self._latest is MakeField:  # field and shape take turns, or a motion would never let the second one come
-            requests.sort(key=lambda request: isinstance(request, MakeField))
+                requests.append(ShapeRequest(posed, self._canonical))
+        if self._latest is FieldRequest:  # field and shape take turns, or a motion would never let the second one come
+            requests.sort(key=lambda request: isinstance(request, FieldRequest))
         # What failed is not tried again for the same pose, nor spoken of for another one.
         wanted = {_key(request) for request in requests}
         self._failed = {key: why for key, why in self._failed.items() if key in wanted}
@@ -88,7 +88,7 @@ class MadeSurfaces:
         """Why something that is wanted cannot be made; None if there is no such thing."""
         return next(iter(self._failed.values()), None)
 
-    def shown(self, posed: Posed, look: Look, is_playing: bool) -> ShownMesh | None:
+    def shown(self, posed: Posed, look: ViewerLook, is_playing: bool) -> ShownMesh | None:
         """Return the surface that is wanted, or the best one there is until it is made; None for none."""
         made, canonical, shape = self._field, self._canonical, self._shape
         # A surface of an earlier pose is better than none, and while playing better than the other kind.
@@ -104,7 +104,7 @@ class MadeSurfaces:
         weights = mesh_c.weights if look.weight_colors else None
         return ShownMesh("skinned", posed, vertices, mesh_c.faces, weights, shape.seconds if has_shape else None)
 
-    def canonical(self, look: Look) -> Mesh | None:
+    def canonical(self, look: ViewerLook) -> Mesh | None:
         """Return the canonical mesh, in the shape of the latest pose whose shape is known; None as long as there is none."""
         if self._canonical is None:
             return None
@@ -119,13 +119,13 @@ class MadeSurfaces:
         joints = posed_joints(self._body.skeleton, transforms)
         return float(joints[:, 1].min() - _BELOW_JOINTS * np.ptp(joints, axis=0).max())
 
-    def _vertices_c(self, look: Look) -> NDArray[np.float32]:
+    def _vertices_c(self, look: ViewerLook) -> NDArray[np.float32]:
         shape = self._shape
         if look.has_pose_shape and shape is not None and shape.canonical is self._canonical:
             return shape.vertices_c
         return self._canonical.surface.mesh.vertices
 
-    def _is_current(self, posed: Posed, look: Look) -> bool:
+    def _is_current(self, posed: Posed, look: ViewerLook) -> bool:
         """Return whether the field's surface is the one that is wanted."""
         made = self._field
         return (
@@ -136,10 +136,10 @@ class MadeSurfaces:
         )
 
 
-def _key(request: MakeCanonical | MakeShape | MakeField) -> tuple:
+def _key(request: CanonicalRequest | ShapeRequest | FieldRequest) -> tuple:
     """Return what a request is for: its kind, the pose it depends on and the resolution."""
-    if isinstance(request, MakeCanonical):
+    if isinstance(request, CanonicalRequest):
         return "canonical", None, request.resolution
-    if isinstance(request, MakeShape):
+    if isinstance(request, ShapeRequest):
         return "shape", request.posed.number, request.canonical.resolution
     return "field", request.posed.number, request.resolution

@@ -6,10 +6,10 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["Worker"]
+__all__ = ["BackgroundWorker"]
 
 
-class Worker:
+class BackgroundWorker:
     """Does one thing at a time, in a thread of its own.
 
     Whoever wants something done asks again when the worker is idle, for what is wanted then: there are no old requests.

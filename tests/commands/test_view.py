@@ -112,8 +112,8 @@ def test_the_page_is_served_and_opened(served, opened, caplog):
     assert "anybody" not in caplog.text
     with urllib.request.urlopen(address, timeout=60) as answer:
         assert answer.status == 200
-    assert server.viewing.motion is None
-    assert server.viewing.look.skinned_resolution == 24
+    assert server.state.motion is None
+    assert server.state.look.skinned_resolution == 24
 
 
 def test_without_a_display_the_way_from_elsewhere_is_told(served, opened, monkeypatch, caplog):
@@ -141,12 +141,12 @@ def test_who_listens_to_all_is_warned(served, opened, caplog):
 def test_pose_files_are_on_the_shelf_and_the_first_one_plays(served):
     files = [pose_file("wave.npz"), pose_file("bend.npz", 5), pose_file("other/wave.npz", 4)]
     server = served(pose=files)
-    assert server.viewing.player.is_playing
-    assert server.viewing.motion.num_frames == 3
+    assert server.state.player.is_playing
+    assert server.state.motion.num_frames == 3
     assert server.controls.motion.names.options == ("none", "file: wave.npz", "file: bend.npz", "file: other/wave.npz")
     assert server.controls.motion.names.value == "file: wave.npz"
     server.controls.motion.choose("file: other/wave.npz")
-    assert server.viewing.motion.num_frames == 4
+    assert server.state.motion.num_frames == 4
 
 
 def test_no_pose_file_hides_another_one(served):
@@ -154,9 +154,9 @@ def test_no_pose_file_hides_another_one(served):
     server = served(pose=files)
     names = ("file: other/wave.npz", "file: wave.npz", "file: wave.npz_2")
     assert server.controls.motion.names.options == ("none", *names)
-    assert server.viewing.motion.num_frames == 4
+    assert server.state.motion.num_frames == 4
     server.controls.motion.choose(names[1])
-    assert server.viewing.motion.num_frames == 3
+    assert server.state.motion.num_frames == 3
 
 
 def test_sequences_of_the_samples_are_on_the_shelf(served, config, toy, monkeypatch):
@@ -196,13 +196,13 @@ def test_without_viser_one_line_before_any_work(config, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"port": "http"}, "port must be a number from 1 to 65535, or auto for any free one, got 'http'"),
-        ({"port": "65536"}, "port must be a number"),
-        ({"port": "-1"}, "port must be a number"),
+        ({"port": "http"}, "port: wanted a number from 1 to 65535, or auto for any free one, got 'http'"),
+        ({"port": "65536"}, "port: wanted a number"),
+        ({"port": "-1"}, "port: wanted a number"),
         ({"host": "203.0.113.7"}, "host 203.0.113.7 is no address of this machine"),
-        ({"surface": "feild"}, "surface must be skinned or field, got 'feild'; did you mean 'field'"),
-        ({"resolution": 15}, "resolution must be between 16 and 1024, got 15"),
-        ({"step": 0}, "step must be at least 1"),
+        ({"surface": "feild"}, "surface: wanted skinned or field, got 'feild'; did you mean 'field'"),
+        ({"resolution": 15}, "resolution: wanted 16 to 1024, got 15"),
+        ({"step": 0}, "step: wanted at least 1"),
         ({"pose": ["nowhere.npz"]}, "no pose file at nowhere.npz"),
         ({"motion": "jumping_jacks"}, "motion jumping_jacks is for SMPL's 24 joints"),
         ({"subject": "50004"}, 'no avatar in .*50004.*; run "snarf train subject=50004" or give ckpt=PATH'),

@@ -71,24 +71,24 @@ def test_the_body_is_seen_posed_and_played_and_nothing_comes_from_elsewhere(page
     assert shares[-1] > 0.01
     page.get_by_text("Pose", exact=True).click()
     turned = threading.Event()
-    turn_joint = page.server.viewing.turn_joint
+    turn_joint = page.server.state.turn_joint
 
     def turn(*arguments) -> None:
         turn_joint(*arguments)
         turned.set()
 
-    page.server.viewing.turn_joint = turn
+    page.server.state.turn_joint = turn
     inputs = page.locator("input:visible")
     inputs.nth(3).fill("40")  # after the joint, x and y
     inputs.nth(3).press("Enter")
     assert turned.wait(_PATIENCE_MS / 1000)
-    assert page.server.viewing.posed.pose[1] == pytest.approx([0, 0, np.radians(40)])
+    assert page.server.state.posed.pose[1] == pytest.approx([0, 0, np.radians(40)])
 
     page.get_by_text("Motion", exact=True).first.click()
     inputs.first.click()
     page.get_by_text("bend", exact=True).click()
     page.get_by_text("Pause").click()
     page.get_by_text("Play", exact=True).wait_for()
-    assert page.server.viewing.motion.name == "bend"
-    assert not page.server.viewing.player.is_playing
+    assert page.server.state.motion.name == "bend"
+    assert not page.server.state.player.is_playing
     assert not page.foreign

@@ -10,7 +10,7 @@ from toy_viewer import PATIENCE, Watched
 
 from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.viewer.picture import Picture
-from snarfcli.viewer.scene import Scene
+from snarfcli.viewer.scene import ViewerScene
 
 viser = pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
 
@@ -26,12 +26,12 @@ def server():
 def watched():
     watched = Watched()
     yield watched
-    watched.viewing.stop()
+    watched.state.stop()
 
 
 @pytest.fixture
-def scene(server, watched) -> Scene:
-    return Scene(server, watched.viewing, lambda joint: None, lambda: watched.now)
+def scene(server, watched) -> ViewerScene:
+    return ViewerScene(server, watched.state, lambda joint: None, lambda: watched.now)
 
 
 def grown_as_bent(surface: SkinnedSurface, pose: Tensor) -> np.ndarray:
@@ -39,7 +39,7 @@ def grown_as_bent(surface: SkinnedSurface, pose: Tensor) -> np.ndarray:
     return surface.mesh.vertices * np.float32(1 + pose[1, 2])
 
 
-def show_settled(scene: Scene, watched: Watched) -> Picture:
+def show_settled(scene: ViewerScene, watched: Watched) -> Picture:
     """Show all pictures until nothing more is being made, as the server does; return the last one."""
     while True:
         watched.woken.clear()
@@ -56,7 +56,7 @@ def show_settled(scene: Scene, watched: Watched) -> Picture:
 def test_a_look_that_changes_between_picture_and_stage_is_not_lost(scene, watched):
     show_settled(scene, watched)
     picture = watched.picture()
-    watched.viewing.change_look(weight_colors=True, shows_skeleton=True)
+    watched.state.change_look(weight_colors=True, shows_skeleton=True)
     scene.show(picture)
     assert scene._body._plain.visible
     assert scene._joints is None
@@ -68,34 +68,34 @@ def test_a_look_that_changes_between_picture_and_stage_is_not_lost(scene, watche
 
 def test_the_shape_beside_a_field_is_that_of_its_pose(scene, watched, monkeypatch):
     monkeypatch.setattr(SkinnedSurface, "canonical_vertices", grown_as_bent)
-    watched.viewing.change_look(surface="field", shows_canonical=True)
+    watched.state.change_look(surface="field", shows_canonical=True)
     show_settled(scene, watched)
     for bend in (0.3, 0.6):
-        watched.viewing.turn_joint(1, np.array([0.0, 0.0, bend]))
+        watched.state.turn_joint(1, np.array([0.0, 0.0, bend]))
         picture = show_settled(scene, watched)
         assert picture.mesh.surface == "field"
         assert np.ptp(scene._canonical._plain.vertices[:, 1]) == pytest.approx((1 + bend) * 2 * RADIUS, abs=0.02)
 
 
 def test_the_shape_beside_stands_on_the_floor_wherever_that_is(scene, watched):
-    watched.viewing.change_look(has_pose_shape=False, shows_canonical=True)
+    watched.state.change_look(has_pose_shape=False, shows_canonical=True)
     show_settled(scene, watched)
-    watched.viewing.floor_y -= 0.5
+    watched.state.floor_y -= 0.5
     show_settled(scene, watched)
     feet = scene._canonical._plain.vertices[:, 1].min() + scene._canonical._frame.position[1]
-    assert feet == pytest.approx(watched.viewing.floor_y)
+    assert feet == pytest.approx(watched.state.floor_y)
 
 
 def test_the_handle_follows_the_joint_unless_somebody_holds_it(scene, watched):
     straight, quarter = np.array([1.0, 0, 0, 0]), np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
-    watched.viewing.change_look(shows_skeleton=True)
+    watched.state.change_look(shows_skeleton=True)
     scene.chosen_joint = 1
     show_settled(scene, watched)
     for client_id in (3, 4):
         scene.turn_chosen(quarter, is_over=False, client_id=client_id)
     scene.turn_chosen(quarter, is_over=True, client_id=4)
     show_settled(scene, watched)
-    np.testing.assert_allclose(watched.viewing.posed.pose[1], (0, 0, np.pi / 2), atol=1e-6)
+    np.testing.assert_allclose(watched.state.posed.pose[1], (0, 0, np.pi / 2), atol=1e-6)
     np.testing.assert_allclose(scene._handle.wxyz, straight, atol=1e-6)  # as the page that turns it has it, not we
     scene.let_go(3)
     show_settled(scene, watched)

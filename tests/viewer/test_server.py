@@ -69,20 +69,20 @@ def test_what_one_changes_all_see(server):
         other.expect()
         one.change("turn z", 30.0)
         other.until_node("/avatar/plain", "vertices")
-        assert server.viewing.posed.pose[1] == pytest.approx([0, 0, np.pi / 6])
+        assert server.state.posed.pose[1] == pytest.approx([0, 0, np.pi / 6])
         other.expect()
         one.change("turn y", 45.0, number=1)  # of the whole body
         other.until_node("/avatar/plain", "vertices")
-        assert server.viewing.posed.pose[0] == pytest.approx([0, np.pi / 4, 0])
+        assert server.state.posed.pose[0] == pytest.approx([0, np.pi / 4, 0])
         one.drop()
         other.change("height", 0.5)
         other.until_node("/avatar/plain", "vertices")
-        assert server.viewing.posed.translation[1] == 0.5
+        assert server.state.posed.translation[1] == 0.5
         with Page(server.server) as late:
             late.expect()
             other.change("Reset pose", True)
             late.until_node("/avatar/plain", "vertices")
-            assert not server.viewing.posed.pose.any()
+            assert not server.state.posed.pose.any()
 
 
 def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(server):
@@ -99,7 +99,7 @@ def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(server):
         page.change("Frame", 3)
         turn = page.uuid("turn z")
         page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == pytest.approx(51.6))
-        assert server.viewing.posed.pose[1, 2] == pytest.approx(0.9)  # not that of the slider's whole tenths
+        assert server.state.posed.pose[1, 2] == pytest.approx(0.9)  # not that of the slider's whole tenths
         page.change("Motion", "broken")
         page.until_text("no such motion")
         page.change("Motion", "none")
@@ -111,14 +111,14 @@ def test_a_slider_changes_one_angle_of_a_pose_that_plays(server):
     with Page(server.server) as page:
         page.until_text("vertices")
         page.expect()
-        with server.viewing._lock:  # no picture before it plays, so the sliders stay at zero
-            server.viewing.load_motion(load_motion("still")[0])
-            server.viewing.play()
+        with server.state._lock:  # no picture before it plays, so the sliders stay at zero
+            server.state.load_motion(load_motion("still")[0])
+            server.state.play()
         page.until(lambda message: message.get("updates", {}).get("label") == "Pause")
         page.change("turn x", 10.0)
         turn = page.uuid("turn z")
         page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == pytest.approx(51.6))
-        assert angles_of(server.viewing.posed.pose[1]) == pytest.approx((10, 0, np.degrees(0.9)))
+        assert angles_of(server.state.posed.pose[1]) == pytest.approx((10, 0, np.degrees(0.9)))
 
 
 def test_the_sliders_show_a_motion_of_one_frame(server):
@@ -127,7 +127,7 @@ def test_the_sliders_show_a_motion_of_one_frame(server):
         page.change("Motion", "pose")
         turn = page.uuid("turn z")
         page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == pytest.approx(51.6))
-        assert not server.viewing.player.is_playing
+        assert not server.state.player.is_playing
 
 
 def test_every_look(server):
@@ -166,7 +166,7 @@ def test_a_click_chooses_a_joint_and_the_handle_turns_it():
             page.expect()
             server.scene.turn_chosen(np.array([quarter, 0, 0, quarter]), is_over=True, client_id=0)
             page.until_node("/avatar/plain", "vertices")
-            assert server.viewing.posed.pose[1] == pytest.approx([0, 0, np.pi / 2])
+            assert server.state.posed.pose[1] == pytest.approx([0, 0, np.pi / 2])
     finally:
         server.stop()
 
@@ -204,7 +204,7 @@ def test_a_skeleton_of_one_joint_turns_as_a_whole():
             assert {props["label"]: props["visible"] for props in folders} == {"Joint": False, "Whole body": True}
             page.change("turn z", 90.0, number=1)
             page.until_node("/avatar/plain", "vertices")
-            assert server.viewing.posed.pose == pytest.approx(np.array([[0, 0, np.pi / 2]]))
+            assert server.state.posed.pose == pytest.approx(np.array([[0, 0, np.pi / 2]]))
     finally:
         server.stop()
 

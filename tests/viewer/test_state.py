@@ -15,7 +15,7 @@ from toy_viewer import PATIENCE, SMALL, Watched
 
 from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.motions import Motion
-from snarfcli.viewer.body import MakeCanonical, MakeField, MakeShape
+from snarfcli.viewer.body import CanonicalRequest, FieldRequest, ShapeRequest
 
 BEND = np.array([0.0, 0.0, 0.9])
 
@@ -24,7 +24,7 @@ BEND = np.array([0.0, 0.0, 0.9])
 def watched():
     watched = Watched()
     yield watched
-    watched.viewing.stop()
+    watched.state.stop()
 
 
 def bending(frames: int = 4, rate: float = 10.0) -> Motion:
@@ -43,12 +43,12 @@ def test_the_first_picture_has_no_surface_and_the_next_one_stands_on_the_floor(w
     assert picture.mesh.surface == "skinned"
     assert picture.mesh.weights is None
     assert picture.canonical is None
-    assert picture.mesh.vertices[:, 1].min() == pytest.approx(watched.viewing.floor_y, abs=1e-4)
+    assert picture.mesh.vertices[:, 1].min() == pytest.approx(watched.state.floor_y, abs=1e-4)
 
 
 def test_a_turned_joint_moves_the_skin_at_once(watched):
     before = watched.settled().mesh
-    watched.viewing.turn_joint(1, BEND)
+    watched.state.turn_joint(1, BEND)
     after = watched.picture().mesh
     assert after.faces is before.faces
     assert after.posed.pose[1, 2] == 0.9
@@ -65,13 +65,13 @@ def test_the_shape_of_the_pose_comes_when_it_is_made(watched, monkeypatch):
 
     watched.settled()
     monkeypatch.setattr(SkinnedSurface, "canonical_vertices", canonical_vertices)
-    before = watched.viewing.picture()[0].mesh.vertices
-    watched.viewing.turn_joint(1, np.zeros(3))  # the same pose, chosen anew
+    before = watched.state.picture()[0].mesh.vertices
+    watched.state.turn_joint(1, np.zeros(3))  # the same pose, chosen anew
     after = watched.settled().mesh
     np.testing.assert_allclose(np.linalg.norm(after.vertices - before, axis=1), 0.01, atol=1e-3)
     assert grown == [0.0]
     assert after.seconds is not None
-    watched.viewing.change_look(has_pose_shape=False)
+    watched.state.change_look(has_pose_shape=False)
     plain = watched.settled().mesh
     np.testing.assert_allclose(plain.vertices, before, atol=1e-5)
     assert grown == [0.0]
@@ -81,7 +81,7 @@ def test_the_shape_of_the_pose_comes_when_it_is_made(watched, monkeypatch):
 def test_a_field_is_made_for_the_latest_pose_only(watched, monkeypatch):
     watched.settled()
     begun, go_on, made = threading.Event(), threading.Event(), []
-    make = watched.viewing.body.make
+    make = watched.state.body.make
 
     def slow(request):
         begun.set()
@@ -89,14 +89,14 @@ def test_a_field_is_made_for_the_latest_pose_only(watched, monkeypatch):
         made.append(request.posed.pose[1, 2])
         return make(request)
 
-    monkeypatch.setattr(watched.viewing._worker, "_work", slow)
-    watched.viewing.change_look(surface="field")
+    monkeypatch.setattr(watched.state._worker, "_work", slow)
+    watched.state.change_look(surface="field")
     picture = watched.picture()
     assert picture.is_computing
     assert picture.mesh.surface == "skinned"
     assert begun.wait(PATIENCE)
     for angle in (0.1, 0.2, 0.3):
-        watched.viewing.turn_joint(1, angle * BEND / 0.9)
+        watched.state.turn_joint(1, angle * BEND / 0.9)
         assert watched.picture().mesh.posed.pose[1, 2] == pytest.approx(angle)
     go_on.set()
     picture = watched.settled()
@@ -109,13 +109,13 @@ def test_a_field_is_made_for_the_latest_pose_only(watched, monkeypatch):
 
 
 def test_a_field_in_colour_has_weights_and_another_resolution_is_made_anew(watched):
-    watched.viewing.change_look(surface="field", weight_colors=True)
+    watched.state.change_look(surface="field", weight_colors=True)
     coarse = watched.settled().mesh
     assert coarse.surface == "field"
     assert coarse.weights.shape == (len(coarse.vertices), 2)
-    watched.viewing.change_look(field_resolution=40)
+    watched.state.change_look(field_resolution=40)
     assert len(watched.settled().mesh.vertices) > 1.5 * len(coarse.vertices)
-    watched.viewing.change_look(surface="skinned", skinned_resolution=40)
+    watched.state.change_look(surface="skinned", skinned_resolution=40)
     assert watched.settled().mesh.weights is not None
 
 
@@ -129,13 +129,13 @@ def test_a_pose_without_surface_is_told_and_the_viewer_goes_on(watched, caplog):
         return samples
 
     watched.avatar.query = sometimes
-    watched.viewing.change_look(surface="field")
+    watched.state.change_look(surface="field")
     assert watched.settled().message is None
-    watched.viewing.turn_joint(1, BEND)
+    watched.state.turn_joint(1, BEND)
     picture = watched.settled()
     assert "unoccupied" in picture.message
     assert picture.mesh.surface == "skinned"
-    watched.viewing.turn_joint(1, BEND / 2)
+    watched.state.turn_joint(1, BEND / 2)
     assert watched.settled().message is None
     assert watched.settled().mesh.surface == "field"
     assert not caplog.records
@@ -144,7 +144,7 @@ def test_a_pose_without_surface_is_told_and_the_viewer_goes_on(watched, caplog):
         raise RuntimeError("out of memory")
 
     watched.avatar.query = broken
-    watched.viewing.turn_joint(1, BEND / 3)
+    watched.state.turn_joint(1, BEND / 3)
     assert watched.settled().message == "out of memory"
     assert "goes on after: RuntimeError" in caplog.text
 
@@ -154,7 +154,7 @@ def test_an_avatar_without_any_surface_is_told_too():
     picture = watched.settled()
     assert picture.mesh is None
     assert picture.message
-    watched.viewing.stop()
+    watched.state.stop()
 
 
 def test_an_avatar_without_weights_shows_its_field_only():
@@ -165,54 +165,54 @@ def test_an_avatar_without_weights_shows_its_field_only():
     assert first.mesh.surface == "field"
     assert first.mesh.weights is None
     assert first.canonical is None
-    watched.viewing.turn_joint(1, BEND)
+    watched.state.turn_joint(1, BEND)
     meanwhile = watched.picture()
     assert meanwhile.is_computing
     assert meanwhile.mesh.posed is first.mesh.posed
     assert watched.settled().mesh.posed.pose[1, 2] == 0.9
-    watched.viewing.stop()
+    watched.state.stop()
 
 
 def test_a_motion_plays_and_a_changed_pose_holds_it(watched):
-    viewing = watched.viewing
+    state = watched.state
     watched.settled()
-    viewing.load_motion(bending())
-    assert viewing.floor_y == pytest.approx(2 - RADIUS, abs=0.02)
-    viewing.play()
+    state.load_motion(bending())
+    assert state.floor_y == pytest.approx(2 - RADIUS, abs=0.02)
+    state.play()
     seen = []
     for watched.now in (0.0, 0.12, 0.25, 0.41):
-        picture, wait = viewing.picture()
+        picture, wait = state.picture()
         assert picture.is_playing
         assert 0 < wait <= 0.1
         seen.append((picture.frame, picture.posed.translation[0]))
     assert seen == [(0, 0.0), (1, 0.5), (2, 1.0), (0, 0.0)]
     watched.now = 0.72
-    viewing.turn_joint(0, np.array([0.0, 0.3, 0.0]))  # starts from the frame that was due
-    picture, wait = viewing.picture()
+    state.turn_joint(0, np.array([0.0, 0.3, 0.0]))  # starts from the frame that was due
+    picture, wait = state.picture()
     assert not picture.is_playing
     assert wait is None
     assert picture.frame == 3
     np.testing.assert_allclose(picture.posed.pose, [(0, 0.3, 0), (0, 0, 0.9)])
     assert picture.posed.translation[0] == 1.5
-    viewing.seek(1)
-    np.testing.assert_allclose(viewing.picture()[0].posed.pose, bending().poses[1])
-    viewing.load_motion(None)
-    viewing.play()
-    assert not viewing.picture()[0].is_playing
+    state.seek(1)
+    np.testing.assert_allclose(state.picture()[0].posed.pose, bending().poses[1])
+    state.load_motion(None)
+    state.play()
+    assert not state.picture()[0].is_playing
 
 
 def test_a_field_while_playing_is_the_last_one_made(watched):
     watched.settled()
-    watched.viewing.change_look(surface="field")
+    watched.state.change_look(surface="field")
     watched.settled()
-    watched.viewing.load_motion(bending())
-    watched.viewing.play()
+    watched.state.load_motion(bending())
+    watched.state.play()
     watched.now = 0.25
     picture = watched.picture()
     assert picture.frame == 2
     assert picture.mesh.surface == "field"
     assert picture.shown.number < picture.posed.number
-    watched.viewing.pause()
+    watched.state.pause()
     assert watched.settled().shown.number == picture.posed.number
 
 
@@ -234,28 +234,28 @@ class AtOnce:
 
 
 def test_the_canonical_shape_follows_while_a_field_plays(watched, monkeypatch):
-    worker = AtOnce(watched.viewing.body.make)
+    worker = AtOnce(watched.state.body.make)
     with monkeypatch.context() as patch:
-        patch.setattr(watched.viewing, "_worker", worker)
-        watched.viewing.change_look(surface="field", shows_canonical=True)
+        patch.setattr(watched.state, "_worker", worker)
+        watched.state.change_look(surface="field", shows_canonical=True)
         for _ in range(4):
             watched.picture()
-        assert worker.kinds == [MakeCanonical, MakeField, MakeShape]
-        watched.viewing.load_motion(bending(16, rate=40.0))
-        watched.viewing.play()
+        assert worker.kinds == [CanonicalRequest, FieldRequest, ShapeRequest]
+        watched.state.load_motion(bending(16, rate=40.0))
+        watched.state.play()
         worker.kinds.clear()
         for watched.now in 0.026 * np.arange(1, 9):  # a frame each; a tenth of a second at least between two shapes
             watched.picture()
-        assert worker.kinds == [*[MakeField] * 3, MakeShape] * 2
+        assert worker.kinds == [*[FieldRequest] * 3, ShapeRequest] * 2
 
 
 def test_over_one_spot(watched):
-    watched.viewing.load_motion(bending())
-    watched.viewing.seek(2)
-    watched.viewing.change_look(is_in_place=True)
-    assert watched.viewing.posed.translation.tolist() == [0, 2, 0]
-    watched.viewing.change_look(is_in_place=False)
-    assert watched.viewing.posed.translation.tolist() == [1, 2, 0]
+    watched.state.load_motion(bending())
+    watched.state.seek(2)
+    watched.state.change_look(is_in_place=True)
+    assert watched.state.posed.translation.tolist() == [0, 2, 0]
+    watched.state.change_look(is_in_place=False)
+    assert watched.state.posed.translation.tolist() == [1, 2, 0]
 
 
 def test_joints_that_stretch_follow_their_own_transforms_until_posed_by_hand(watched):
@@ -264,34 +264,34 @@ def test_joints_that_stretch_follow_their_own_transforms_until_posed_by_hand(wat
     transforms[3, 1, 0, 3] = 0.25
     transforms[:, :, 0, 3] += 0.5
     motion = replace(bending(), poses=np.zeros((4, 2, 3)), translation=np.tile([0.5, 0, 0], (4, 1)))
-    watched.viewing.load_motion(motion, transforms)
-    watched.viewing.seek(3)
+    watched.state.load_motion(motion, transforms)
+    watched.state.seek(3)
     assert watched.picture().mesh.vertices[:, 0].max() == pytest.approx(2 * LENGTH + RADIUS + 0.75, abs=0.02)
-    watched.viewing.change_look(is_in_place=True)
+    watched.state.change_look(is_in_place=True)
     assert watched.picture().mesh.vertices[:, 0].max() == pytest.approx(2 * LENGTH + RADIUS + 0.25, abs=0.02)
-    watched.viewing.turn_joint(1, np.zeros(3))
+    watched.state.turn_joint(1, np.zeros(3))
     assert watched.picture().mesh.vertices[:, 0].max() == pytest.approx(2 * LENGTH + RADIUS, abs=0.02)
 
 
 def test_reset_mirror_and_height(watched):
-    viewing = watched.viewing
-    viewing.load_motion(bending())
-    viewing.seek(3)
-    viewing.mirror_joint(1)  # without a counterpart nothing changes
-    assert viewing.posed.pose[1, 2] == pytest.approx(0.9)
-    viewing.move_root(1, 2.5)
-    assert viewing.posed.translation.tolist() == [1.5, 2.5, 0]
-    viewing.reset_pose()
+    state = watched.state
+    state.load_motion(bending())
+    state.seek(3)
+    state.mirror_joint(1)  # without a counterpart nothing changes
+    assert state.posed.pose[1, 2] == pytest.approx(0.9)
+    state.move_root(1, 2.5)
+    assert state.posed.translation.tolist() == [1.5, 2.5, 0]
+    state.reset_pose()
     picture = watched.settled()
     assert not picture.posed.pose.any()
     assert picture.posed.translation[[0, 2]].tolist() == [0, 0]
-    viewing.reset_pose()  # now that the skin is known: exactly on the floor
-    assert watched.settled().mesh.vertices[:, 1].min() == pytest.approx(viewing.floor_y, abs=1e-3)
+    state.reset_pose()  # now that the skin is known: exactly on the floor
+    assert watched.settled().mesh.vertices[:, 1].min() == pytest.approx(state.floor_y, abs=1e-3)
 
 
 def test_the_canonical_shape_beside_it(watched):
-    watched.viewing.change_look(shows_canonical=True)
-    watched.viewing.turn_joint(1, BEND)
+    watched.state.change_look(shows_canonical=True)
+    watched.state.turn_joint(1, BEND)
     picture = watched.settled()
     assert np.ptp(picture.canonical.vertices[:, 0]) == pytest.approx(2 * (LENGTH + RADIUS), abs=0.02)
     assert picture.canonical.weights is not None

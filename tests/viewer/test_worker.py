@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from snarfcli.viewer.worker import Worker
+from snarfcli.viewer.worker import BackgroundWorker
 
 PATIENCE = 30  # seconds; nothing waits that long unless something is wrong
 
@@ -22,7 +22,7 @@ def test_one_thing_at_a_time_and_nothing_queued(idle):
         assert go_on.wait(PATIENCE)
         return 2 * number
 
-    worker = Worker(work, idle.set)
+    worker = BackgroundWorker(work, idle.set)
     assert worker.take() is None
     assert worker.start(1)
     assert begun.wait(PATIENCE)
@@ -44,7 +44,7 @@ def test_an_error_is_handed_over(idle):
     def work(request):
         raise ValueError("no surface")
 
-    worker = Worker(work, idle.set)
+    worker = BackgroundWorker(work, idle.set)
     worker.start("it")
     assert idle.wait(PATIENCE)
     request, result, error = worker.take()

@@ -1,4 +1,4 @@
-"""What BVH and glTF files have in common: a tree of joints, clips of motion, and a mesh that the joints move."""
+"""The common content of BVH and glTF files: a tree of joints, motion clips, and a skinned mesh."""
 
 from __future__ import annotations
 
@@ -12,39 +12,42 @@ __all__ = ["Rig", "RigClip", "RigMesh"]
 
 @dataclass(frozen=True, eq=False)
 class RigClip:
-    """One motion of a rig, sampled at equal times."""
+    """One motion of a rig, sampled at equal time steps."""
 
     name: str
-    """Its name in the file, made up if it has none."""
+    """Name in the file; generated if the file has none."""
     frame_rate: float
-    """Frames a second."""
+    """Frames per second."""
     world_from_joint: NDArray[np.float64]
-    """[T, J, 4, 4] where each joint is: from its own frame to the world, in the units of the file. May hold scale."""
+    """[T, J, 4, 4], transforms from the frame of each joint to the world, units of the file; may contain scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigMesh:
-    """A triangle mesh in the rest pose, with the weights by which it follows the joints."""
+    """A triangle mesh in the rest pose, with skinning weights.
+
+    Linear blend skinning poses it: each vertex moves by `world_from_joint @ inv(rest)` of the joints, blended by its weights.
+    """
 
     vertices: NDArray[np.float64]
-    """[V, 3] in the world, units of the file, moved by `world_from_joint @ inv(rest)`, blended by the weights."""
+    """[V, 3], world frame, units of the file."""
     faces: NDArray[np.int64]
-    """[F, 3] triangles."""
+    """[F, 3], triangles."""
     weights: NDArray[np.float64]
-    """[V, J] non-negative, rows sum to 1."""
+    """[V, J], non-negative, rows sum to 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A tree of joints at rest, its motions and its mesh."""
+    """A tree of joints at rest, with its motions and its mesh."""
 
     names: tuple[str, ...]
-    """J joint names, each once."""
+    """J unique joint names."""
     parents: tuple[int, ...]
     """J parents, -1 for a root; a parent comes before its children, joint 0 is a root."""
     rest: NDArray[np.float64]
-    """[J, 4, 4] where each joint is at rest: from its own frame to the world, units of the file."""
+    """[J, 4, 4], transforms from the frame of each joint at rest to the world, units of the file."""
     clips: tuple[RigClip, ...]
-    """The motions, none or more."""
+    """The motions; may be empty."""
     mesh: RigMesh | None = None
     """The mesh, if the file has one."""

@@ -161,8 +161,8 @@ def test_what_is_odd_is_noted(tmp_path, caplog):
     with caplog.at_level(logging.INFO, "snarfcli"):
         text = ARM.replace("Frames: 2", "Frames: 9").replace("Frame Time: 0.008333\n", "")
         read_bvh(write(tmp_path, text + FRAMES + "1 2 3"))
-    assert "'9' frames are declared, 2 are there" in caplog.text
-    assert "no frame time given, 60 frames a second assumed" in caplog.text
+    assert "'9' frames are declared, 2 were found" in caplog.text
+    assert "no frame time given, 60 frames per second assumed" in caplog.text
     assert "the last frame is incomplete and was left out" in caplog.text
 
 
@@ -187,7 +187,7 @@ def test_deep_nesting_is_no_recursion(tmp_path):
         ("", "line 0: a BVH file begins with HIERARCHY"),
         ("\x00\x01binary", "line 1: a BVH file begins with HIERARCHY"),
         ("HIERARCHY\n", "line 1: there is no ROOT"),
-        ("HIERARCHY\nJOINT a", "line 2: a ROOT stands alone"),
+        ("HIERARCHY\nJOINT a", "line 2: a ROOT must stand outside"),
         ("HIERARCHY\nROOT a", "line 2: the file ends after the name of a joint"),
         ("HIERARCHY\nROOT a\nOFFSET 0 0 0", "line 3: wanted { after the name of a joint, got 'OFFSET'"),
         ("HIERARCHY\nROOT a {\nOFFSET 0 0", "line 3: the file ends inside the hierarchy"),
@@ -196,19 +196,19 @@ def test_deep_nesting_is_no_recursion(tmp_path):
         ("HIERARCHY\nROOT a {\nCHANNELS 3 Xrotation Yrotation Wrotation", "wanted a channel such as .*, got 'Wrotation'"),
         ("HIERARCHY\nROOT a {\nCHANNELS 2 Xrotation xRotation", "a channel is named twice"),
         ("HIERARCHY\nROOT a {\nCHANNELS 99999999999", "wanted 0 to 6 channels, got '99999999999'"),
-        ("HIERARCHY\nROOT a {\nROOT b {", "line 3: a ROOT stands alone"),
-        ("HIERARCHY\nROOT a {\nEnd Site {\nJOINT b {", "line 4: an End Site holds no joints"),
+        ("HIERARCHY\nROOT a {\nROOT b {", "line 3: a ROOT must stand outside"),
+        ("HIERARCHY\nROOT a {\nEnd Site {\nJOINT b {", "line 4: an End Site cannot contain joints"),
         ("HIERARCHY\nROOT a {\nOFSET 0 0 0 }", "line 3: wanted OFFSET, CHANNELS, JOINT, End Site or a brace, got 'OFSET'"),
         ("HIERARCHY\nROOT a {\nOFFSET 0 0 0\nMOTION\n", "line 4: the braces of 1 joints are not closed"),
         ("HIERARCHY\nROOT a { }\n}\nMOTION\n", "line 3: wanted ROOT or MOTION, got '}'"),
         ("HIERARCHY\n" + "ROOT a { }\n" * 5001, "line 5002: there are more than 5000 joints"),
-        (ARM + "0 90 1.5 10 20 30 -40 50 60 70 6 7\n", "line 29: frame 0 has 12 values, wanted 11, one for each channel"),
-        (ARM + "0 90 1.5 10 20 30 -40 50 60 70 nan\n", "line 29: frame 0 holds NaN"),
+        (ARM + "0 90 1.5 10 20 30 -40 50 60 70 6 7\n", "line 29: frame 0: wanted 11 values, one per channel, got 12"),
+        (ARM + "0 90 1.5 10 20 30 -40 50 60 70 nan\n", "line 29: frame 0 has NaN"),
         (ARM + "0 90 1,5 10 20 30 -40 50 60 70 6\n", "line 29: wanted a number, got '1,5'"),
         (ARM.replace("0.008333", "fast") + FRAMES, "line 28: wanted a number, got 'fast'"),
         (ARM.replace("0.008333", "-1") + FRAMES, "line 28: wanted a frame time in seconds, got '-1'"),
         (ARM.replace("10.0", "1e308").replace("5.0", "1e308") + "0 1e308 0 0 0 0 0 0 0 0 0\n", "numbers too large"),
-        ("x" * 2**20, "line 1: it is too long"),
+        ("x" * 2**20, "line 1: the line is too long"),
     ],
 )  # fmt: skip
 def test_broken_files_end_in_one_line(tmp_path, text, message):
@@ -229,5 +229,5 @@ def test_missing_files(tmp_path):
 def test_few_channels_and_many_joints_take_no_memory(tmp_path):
     text = "HIERARCHY\n" + "ROOT a { OFFSET 0 0 0 CHANNELS 0 }\n" * 4999
     text += "ROOT b { CHANNELS 1 Xrotation }\nMOTION\nFrames: 1000000\nFrame Time: 1\n" + "0\n" * 1000
-    with pytest.raises(UserError, match="there are more than 419 frames of 5000 joints; cut the file into parts"):
+    with pytest.raises(UserError, match="wanted at most 419 frames of 5000 joints, got more; cut the file into parts"):
         read_bvh(write(tmp_path, text))

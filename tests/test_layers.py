@@ -28,7 +28,6 @@ LAYERS = (
         "files",
         "formats",
         "native",
-        "names",
         "parallel",
         "precision",
         "progress",
@@ -37,7 +36,7 @@ LAYERS = (
         "segments",
         "settings",
     ),
-    ("errors",),
+    ("errors", "names"),
 )
 """Folders and top-level modules of the package, from the top; those of one layer do not know each other."""
 

@@ -1,6 +1,18 @@
 from __future__ import annotations
 
-from snarfcli.names import folder_name, folder_names
+from snarfcli.names import folder_name, folder_names, unique_names
+
+
+def test_a_name_that_is_taken_gets_the_first_free_number():
+    assert unique_names(["walk", "run", "walk", "walk", "walk_2", "Walk"]) == [
+        "walk",
+        "run",
+        "walk_2",
+        "walk_3",
+        "walk_2_2",
+        "Walk",
+    ]
+    assert unique_names(["walk_2", "walk", "walk"]) == ["walk_2", "walk", "walk_3"]
 
 
 def test_names_become_folders():

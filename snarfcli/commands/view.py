@@ -16,9 +16,9 @@ from snarfcli.avatar import Avatar
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.selection import AvatarChoice, MotionChoice, check_motion_choice, choose_motion, load_chosen_avatar
 from snarfcli.errors import UserError
-from snarfcli.export.rig import unique_names
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL, layout_of
+from snarfcli.names import unique_names
 from snarfcli.samples.store import SampleStore
 from snarfcli.viewer.picture import SURFACE_NAMES, ViewerLook
 from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback, require_viser

@@ -26,11 +26,11 @@ from snarfcli.export.rig import (
     decompose,
     local_frames,
     recompose,
-    unique_names,
 )
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
 from snarfcli.meshing.skinned import SkinnedSurface, skinned_surface
+from snarfcli.names import unique_names
 from snarfcli.progress import progress
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def build_character(
     """
     mesh, parents = surface.mesh, avatar.skeleton.parents
     bind = bind_frames(avatar.skeleton)
-    names = unique_names([clip.motion.name for clip in clips])
+    names = unique_names(clip.motion.name or "clip" for clip in clips)
     transforms = [clip_transforms(avatar.skeleton, clip) for clip in clips]
     locals_ = [decompose(local_frames(moved @ bind, parents)) for moved in transforms]
     lengths = [clip.motion.num_frames for clip in clips]

@@ -32,7 +32,6 @@ __all__ = [
     "lowest_point",
     "on_ground",
     "recompose",
-    "unique_names",
 ]
 
 HEIGHTS = ("auto", "ground", "file")
@@ -146,19 +145,6 @@ def on_ground(mesh: Mesh, skeleton: Skeleton, clip: Clip) -> tuple[Clip, float]:
         transforms = np.array(transforms)
         transforms[:, :, 1, 3] += up
     return replace(clip, motion=motion, bone_transforms=transforms), up
-
-
-def unique_names(names: Sequence[str]) -> list[str]:
-    """Return the names, those that come again with a number: walk, walk_2."""
-    found: list[str] = []
-    for name in names:
-        name = name or "clip"
-        copy, number = name, 1
-        while copy in found:
-            number += 1
-            copy = f"{name}_{number}"
-        found.append(copy)
-    return found
 
 
 def _lengths(linear: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from snarfcli.errors import UserError
 from snarfcli.formats.bvh_hierarchy import BvhJoint, BvhLines, read_hierarchy, read_number, shown
 from snarfcli.formats.rig import Rig, RigClip
+from snarfcli.names import unique_names
 
 __all__ = ["read_bvh"]
 
@@ -62,22 +63,7 @@ def read_bvh(path: str | Path) -> Rig:
         is_sane = all(np.isfinite(world[..., 3].sum()) for world in (rest, *(clip.world_from_joint for clip in clips)))
     if not is_sane:
         raise UserError(f"BVH file {path} has numbers too large to add up; export or download it again")
-    return Rig(_unique([joint.name for joint in joints]), tuple(joint.parent for joint in joints), rest, clips)
-
-
-def _unique(names: list[str]) -> tuple[str, ...]:
-    """Return the names, with a number appended to those that occurred before."""
-    taken: set[str] = set()
-    counts: dict[str, int] = {}
-    unique = []
-    for name in names:
-        title = name
-        while title in taken:
-            counts[name] = counts.get(name, 1) + 1
-            title = f"{name}_{counts[name]}"
-        taken.add(title)
-        unique.append(title)
-    return tuple(unique)
+    return Rig(tuple(unique_names(joint.name for joint in joints)), tuple(joint.parent for joint in joints), rest, clips)
 
 
 def _read_motion(lines: BvhLines, joints: list[BvhJoint]) -> tuple[NDArray[np.float64], float]:

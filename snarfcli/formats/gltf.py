@@ -20,6 +20,7 @@ from snarfcli.formats.gltf_motion import read_animations
 from snarfcli.formats.gltf_nodes import NodeTree
 from snarfcli.formats.gltf_place import placed_skins
 from snarfcli.formats.rig import Rig, RigClip, RigMesh
+from snarfcli.names import unique_names
 
 __all__ = ["read_gltf", "read_gltf_surface"]
 
@@ -260,13 +261,8 @@ def _check_transforms(file: GltfFile, matrices: NDArray[np.float64], names: Iter
 
 def _unique(names: Iterable[Any], what: str) -> tuple[str, ...]:
     """Return printable names, each once."""
-    found: dict[str, None] = {}
+    found = []
     for number, name in enumerate(names):
         name = "".join(letter if letter.isprintable() else "_" for letter in name[:100]) if isinstance(name, str) else ""
-        base = name = name or f"{what}_{number}"
-        copy = 1
-        while name in found:
-            copy += 1
-            name = f"{base}_{copy}"
-        found[name] = None
-    return tuple(found)
+        found.append(name or f"{what}_{number}")
+    return tuple(unique_names(found))

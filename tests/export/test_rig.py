@@ -14,7 +14,6 @@ from snarfcli.export.rig import (
     decompose,
     local_frames,
     recompose,
-    unique_names,
 )
 
 TOY = ToyCharacter()
@@ -84,8 +83,3 @@ def test_skinning_is_the_avatars():
     wanted = TOY.skin(points, torch.from_numpy(transforms).float())
     found = skin_vertices(vertices, TOY.skinning_weights(points).numpy(), transforms)
     np.testing.assert_allclose(found, wanted, atol=2e-6)
-
-
-def test_names_come_once():
-    names = ["walk", "run", "walk", "walk", "walk_2", ""]
-    assert unique_names(names) == ["walk", "run", "walk_2", "walk_3", "walk_2_2", "clip"]

@@ -26,7 +26,7 @@ def run_folder(output_root: str, data: str, subject: str, run: str) -> Path:
     """
     for name, value in (("data.name", data), ("subject", str(subject)), ("run", run)):
         if value in ("", ".", "..") or any(separator in value for separator in "/\\:"):
-            raise UserError(f"{name} must be the name of a folder, without / \\ and :, got '{value}'")
+            raise UserError(f"{name}: wanted the name of a folder, without / \\ and :, got '{value}'")
     return Path(output_root) / data / str(subject) / run
 
 
@@ -62,9 +62,9 @@ def choose_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise UserError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}") from None
+        raise UserError(f"device: wanted auto, cpu, cuda or cuda:N, got {name!r}") from None
     if device.type not in ("cpu", "cuda"):
-        raise UserError(f"device must be auto, cpu, cuda or cuda:N, got {name!r}")
+        raise UserError(f"device: wanted auto, cpu, cuda or cuda:N, got {name!r}")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         seen = torch.cuda.device_count()
         raise UserError(f"device {name} is not there: PyTorch {torch.__version__} sees {seen} GPUs; use device=cpu")
@@ -75,7 +75,7 @@ def set_threads(threads: int | None) -> None:
     """Use so many threads for tensor work; None leaves PyTorch's choice, which follows OMP_NUM_THREADS."""
     if threads is not None:
         if threads < 1:
-            raise UserError(f"threads must be at least 1, got {threads}")
+            raise UserError(f"threads: wanted at least 1, got {threads}")
         torch.set_num_threads(threads)
 
 

@@ -13,9 +13,9 @@ from snarfcli.runs import choose_device, find_avatar, run_folder
 def test_a_run_has_a_folder_of_its_own():
     assert run_folder("outputs", "builtin", "50002", "a.b-c") == Path("outputs/builtin/50002/a.b-c")
     for run in ("", ".", "..", "a/b", "/tmp", "..\\up", "C:x"):
-        with pytest.raises(UserError, match="run must be the name of a folder"):
+        with pytest.raises(UserError, match="run: wanted the name of a folder"):
             run_folder("outputs", "builtin", "50002", run)
-    with pytest.raises(UserError, match=r"subject must be the name of a folder, .* got '\.\.'"):
+    with pytest.raises(UserError, match=r"subject: wanted the name of a folder, .* got '\.\.'"):
         run_folder("outputs", "builtin", "..", "mine")
 
 

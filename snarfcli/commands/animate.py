@@ -135,9 +135,7 @@ def _check(config: AnimateConfig) -> _Plan:
     size = re.fullmatch(r"\s*(\d+)(?:\s*x\s*(\d+))?\s*", config.video_size)
     numbers = (int(size[1]), int(size[2] or size[1])) if size else (0, 0)
     if not all(16 <= pixels <= _LARGEST_PICTURE for pixels in numbers):
-        raise UserError(
-            f"video_size must be a number such as 512 or 1280x720, 16 to {_LARGEST_PICTURE}, got {config.video_size}"
-        )
+        raise UserError(f"video_size: wanted pixels such as 512 or 1280x720, 16 to {_LARGEST_PICTURE}, got {config.video_size}")
     views = parse_views(config.views, config.azimuth_deg, config.elevation_deg)
     for name in config.beside:
         check_choice("beside", name, CONTENTS)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
-from snarfcli.checks import check_choice, check_number
+from snarfcli.checks import check_choice, check_number, check_positive
 from snarfcli.deformer import SearchConfig, SkinningConfig
 from snarfcli.deformer.deformer import FIELDS
 from snarfcli.deformer.hierarchy import SOFTMAXES
@@ -28,9 +26,8 @@ def check_search(search: SearchConfig) -> None:
     if search.name == "complete" and search.jacobian != "exact":
         raise UserError("search.jacobian=broyden is for search=broyden; the complete search has the exact one at hand")
     check_number("search.max_steps", search.max_steps, 1)
-    for name, value in (("tolerance", search.tolerance), ("divergence", search.divergence)):
-        if not 0 < value < math.inf:
-            raise UserError(f"search.{name} must be positive, got {value}")
+    check_positive("search.tolerance", search.tolerance)
+    check_positive("search.divergence", search.divergence)
 
 
 def check_skinning(skinning: SkinningConfig, search: SearchConfig) -> None:
@@ -44,16 +41,14 @@ def check_skinning(skinning: SkinningConfig, search: SearchConfig) -> None:
     for name, least in (("resolution", 2), ("margin_m", 0)):
         values = getattr(skinning, name)
         if len(values) != 3:
-            raise UserError(f"skinning.{name} must be three numbers, along x, y and z, got {values}")
+            raise UserError(f"skinning.{name}: wanted three numbers, along x, y and z, got {values}")
         for value in values:
             check_number(f"skinning.{name}", value, least)
     for name in ("width", "depth"):
         check_number(f"skinning.{name}", getattr(skinning, name), 1)
     check_number("skinning.smoothness", skinning.smoothness, 0)
     for name in ("sharpness", "prior_falloff_m"):
-        value = getattr(skinning, name)
-        if value is not None and not 0 < value < math.inf:
-            raise UserError(f"skinning.{name} must be positive, got {value}")
+        check_positive(f"skinning.{name}", getattr(skinning, name))
     if skinning.smoothness and skinning.name != "voxel":
         raise UserError("skinning.smoothness is for skinning=voxel; the other fields are smooth by themselves")
     if skinning.weights_file is not None and skinning.name != "preset":

@@ -77,7 +77,7 @@ def run(config: PreprocessConfig) -> None:
     }
     for split, step in steps.items():
         if step < 1:
-            raise UserError(f"data: the frame step of {split} sequences must be at least 1, got {step}")
+            raise UserError(f"data: wanted a frame step of at least 1 for {split} sequences, got {step}")
     if config.workers < 0:
         raise UserError(f"workers: wanted a number of processes, or 0 for one a core, got {config.workers}")
     workers = config.workers or count_cores()

@@ -196,7 +196,7 @@ def make_plan(experiment: Experiment, choice: Choice, resolve: Callable[[Sequenc
         raise UserError(_unknown_systems(unknown, experiment.rows))
     rows = [row for row in experiment.rows if not choice.systems or row.key in choice.systems]
     if len(set(choice.seeds)) != len(choice.seeds) or not choice.seeds or min(choice.seeds) < 0:
-        raise UserError(f"seeds must be different whole numbers from 0, at least one, got {list(choice.seeds)}")
+        raise UserError(f"seeds: wanted different whole numbers from 0, at least one, got {list(choice.seeds)}")
     common = (f"data={data}", f"training={training}")
     _check_extra(choice.extra)
     resolved = {}

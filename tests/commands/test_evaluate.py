@@ -169,16 +169,16 @@ def test_an_avatar_of_another_skeleton_is_refused(config, store):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"split": "odd"}, "split must be id or ood, got 'odd'; did you mean 'ood'"),
-        ({"max_frames": 0}, "max_frames must be at least 1, got 0"),
-        ({"points": 1}, "points must be at least 2, got 1"),
-        ({"figure_resolution": 4}, "figure_resolution must be at least 16"),
-        ({"search": SearchConfig(name="broiden")}, "search.name must be .* did you mean 'broyden'"),
+        ({"split": "odd"}, "split: wanted id or ood, got 'odd'; did you mean 'ood'"),
+        ({"max_frames": 0}, "max_frames: wanted at least 1, got 0"),
+        ({"points": 1}, "points: wanted at least 2, got 1"),
+        ({"figure_resolution": 4}, "figure_resolution: wanted at least 16"),
+        ({"search": SearchConfig(name="broiden")}, "search.name: wanted .* did you mean 'broyden'"),
         ({"search": SearchConfig(name="broyden", init_bones=[7])}, r"search.init_bones must lie in 0..1, got \[7\]"),
-        ({"seed": -1}, "seed must be at least 0"),
-        ({"search": SearchConfig(jacobian="broiden")}, "search.jacobian must be exact or broyden, .* did you mean 'broyden'"),
+        ({"seed": -1}, "seed: wanted at least 0"),
+        ({"search": SearchConfig(jacobian="broiden")}, "search.jacobian: wanted exact or broyden, .* did you mean 'broyden'"),
         ({"search": SearchConfig(jacobian="broyden")}, "search.jacobian=broyden is for search=broyden"),
-        ({"search": SearchConfig(tolerance=0.0)}, "search.tolerance must be positive"),
+        ({"search": SearchConfig(tolerance=0.0)}, "search.tolerance: wanted a positive number"),
         ({"search": SearchConfig(name="complete", init_bones=[0])}, "search.init_bones is for search=broyden"),
     ],
 )
@@ -266,5 +266,5 @@ def test_surfaces_are_compared(config, store, caplog):
     assert "surfaces of 2 frames at resolution 48: Chamfer distance" in caplog.text
     run(config)
     assert read(folder_of(config) / "eval_id")["surfaces"] is None
-    with pytest.raises(UserError, match="surface_frames must be at least 0, got -1"):
+    with pytest.raises(UserError, match="surface_frames: wanted at least 0, got -1"):
         run(replace(config, surface_frames=-1))

@@ -218,7 +218,7 @@ def test_an_existing_file_stays_until_overwrite(folder, capsys):
     (folder / "avatar.pt").unlink()  # refused before anything is looked at
     code, err = export(capsys, *arguments)
     assert code == 2
-    assert err.endswith("50002.glb is there already; give overwrite=true to replace it, or output=FILE\n")
+    assert err.endswith("50002.glb exists already; give overwrite=true to replace it, or output=FILE\n")
     assert path.read_bytes() == b"mine"
     (folder / "avatar.pt").write_bytes(b"the toy")
     assert export(capsys, *arguments, "overwrite=true")[0] == 0
@@ -230,7 +230,7 @@ def test_a_file_where_the_record_goes_stays_until_overwrite(folder, toy, capsys)
     arguments = ("--pose", pose_file("walk.npz", 1), "output=me.glb")
     code, err = export(capsys, *arguments)
     assert code == 2
-    assert "me_glb.json is there already; give overwrite=true to replace it" in err
+    assert "me_glb.json exists already; give overwrite=true to replace it" in err
     assert Path("me_glb.json").read_text() == "mine"
     assert not Path("me.glb").exists()
     assert export(capsys, *arguments, "overwrite=true")[0] == 0
@@ -282,12 +282,12 @@ def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["format=gltf"], "format must be glb or ply or obj or fbx or usd, got 'gltf'; did you mean"),
-        (["influences=3"], "influences must be 4 or 8, got 3"),
-        (["triangles=50"], "triangles must be between 100 and 5000000, got 50"),
-        (["triangles=99999999"], "triangles must be between"),
-        (["morph_targets=65"], "morph_targets must be between 0 and 64, got 65"),
-        (["step=0"], "step must be at least 1"),
+        (["format=gltf"], "format: wanted glb, ply, obj, fbx or usd, got 'gltf'; did you mean"),
+        (["influences=3"], "influences.* 4 or 8, got 3"),
+        (["triangles=50"], "triangles: wanted 100 to 5000000, got 50"),
+        (["triangles=99999999"], "triangles: wanted "),
+        (["morph_targets=65"], "morph_targets: wanted 0 to 64, got 65"),
+        (["step=0"], "step: wanted at least 1"),
         (["output=me.fbx"], "output me.fbx should end in .glb; give format=fbx, or give another name"),
         (["output=me"], "output me should end in .glb; give another name"),
         (["output=."], "should end in .glb"),

@@ -182,7 +182,7 @@ def test_an_open_mesh_is_said_once(tmp_path: Path, subject: list[SubjectData], c
     [
         ({"subject": "tot"}, "no built-in subject 'tot'"),
         ({"data": DataConfig("biultin", 1, 1, 1)}, "no data set 'biultin'; did you mean 'builtin'"),
-        ({"data": DataConfig("builtin", 0, 1, 1)}, "frame step of train sequences must be at least 1, got 0"),
+        ({"data": DataConfig("builtin", 0, 1, 1)}, "wanted a frame step of at least 1 for train sequences, got 0"),
         ({"sequences": ["bnd"]}, "no sequence 'bnd'; did you mean 'bend'"),
         ({"workers": -1}, "workers: wanted"),
         ({"points_per_frame": 30}, "multiple of 8"),

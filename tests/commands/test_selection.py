@@ -93,10 +93,10 @@ def test_what_cannot_be_used_is_refused(skeleton, walk):
     with pytest.raises(UserError, match="start=90, stop=null leave no frame: walk has frames 0 to 24"):
         choose(skeleton, walk, start=90)
     for changes, message in (
-        ({"frame_rate": 0.0}, "frame_rate must be between 1.0 and 1000.0, got 0.0"),
-        ({"frame_rate": float("nan")}, "frame_rate must be between 1.0 and 1000.0, got nan"),
-        ({"step": 0}, "step must be at least 1, got 0"),
-        ({"up": "x"}, "up must be auto or y or z, got .x."),
+        ({"frame_rate": 0.0}, "frame_rate: wanted 1.0 to 1000.0, got 0.0"),
+        ({"frame_rate": float("nan")}, "frame_rate: wanted 1.0 to 1000.0, got nan"),
+        ({"step": 0}, "step: wanted at least 1, got 0"),
+        ({"up": "x"}, "up: wanted auto, y or z, got .x."),
     ):
         with pytest.raises(UserError, match=message):
             check_motion_choice(replace(PLAIN, **changes))

@@ -120,14 +120,14 @@ def test_a_damaged_checkpoint_is_named_and_left(config):
 @pytest.mark.parametrize(
     ("group", "changes", "message"),
     [
-        ("model", {"name": "slow_snarf"}, "model.name must be fast_snarf or .* did you mean 'fast_snarf'"),
-        ("model", {"blend": "mean"}, "model.blend must be logit or probability, got 'mean'"),
-        ("shape", {"activation": "tanh"}, "shape.activation must be"),
-        ("shape", {"depth": 0}, "shape.depth must be at least 1, got 0"),
-        ("training", {"poses_per_step": 0}, "training.poses_per_step must be at least 1"),
+        ("model", {"name": "slow_snarf"}, "model.name: wanted fast_snarf, .* did you mean 'fast_snarf'"),
+        ("model", {"blend": "mean"}, "model.blend.* logit or probability, got 'mean'"),
+        ("shape", {"activation": "tanh"}, "shape.activation"),
+        ("shape", {"depth": 0}, "shape.depth: wanted at least 1, got 0"),
+        ("training", {"poses_per_step": 0}, "training.poses_per_step: wanted at least 1"),
         ("training", {"uniform_points": 0, "surface_points": 0}, "nothing could be learned"),
-        ("training", {"joint_target": "own_"}, "training.joint_target must be halves or parent or own, .* did you mean 'own'"),
-        ("training", {"learning_rate": float("nan")}, "training.learning_rate must be between"),
+        ("training", {"joint_target": "own_"}, "training.joint_target: wanted halves, parent or own, .* did you mean 'own'"),
+        ("training", {"learning_rate": float("nan")}, "training.learning_rate: wanted "),
     ],
 )
 def test_settings_that_cannot_be_used_make_nothing(config, group, changes, message):

@@ -135,7 +135,7 @@ def test_hands_are_one_of_two_choices(old: Path, data: str) -> None:
     released, rest = load(old, data, hands="released"), load(old, data)
     assert all(np.allclose(spec.motion.poses[:, 22:], 0.3) for spec in released.sequences)
     assert not any(spec.motion.poses[:, 22:].any() for spec in rest.sequences)
-    with pytest.raises(UserError, match=r"data.hands must be rest or released, got 'fist'"):
+    with pytest.raises(UserError, match=r"data.hands: wanted rest or released, got 'fist'"):
         load(old, data, hands="fist")
 
 

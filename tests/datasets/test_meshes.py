@@ -359,7 +359,7 @@ def test_what_is_missing_is_said(animal, tmp_path):
     assert meshes.subjects(request(tmp_path)) == ("rex",)
     with pytest.raises(UserError, match=r"no subject 'rax' in .*; did you mean 'rex'"):
         meshes.load("rax", request(tmp_path))
-    with pytest.raises(UserError, match=r"data.up must be auto or y or z, got 'x'"):
+    with pytest.raises(UserError, match=r"data.up: wanted auto, y or z, got 'x'"):
         meshes.load("rex", request(tmp_path, up="x"))
     with pytest.raises(UserError, match=r"data.scale must be auto or a number .* got 'cm'"):
         meshes.load("rex", request(tmp_path, scale="cm"))

@@ -121,8 +121,8 @@ WRONG = [
     ({"systems": ("nsa",)}, "there is no row 'nsa'; did you mean 'nasa'?"),
     ({"training": "quik"}, "there is no training=quik; did you mean 'quick'?"),
     ({"data": "cape"}, "table1 is made on data=builtin or dfaust, got 'cape'"),
-    ({"seeds": (1, 1)}, "seeds must be different"),
-    ({"seeds": ()}, "seeds must be different whole numbers from 0, at least one"),
+    ({"seeds": (1, 1)}, "seeds: wanted different"),
+    ({"seeds": ()}, "seeds: wanted different whole numbers from 0, at least one"),
     ({"extra": ("seed=3",)}, "extra: seed is set by reproduce itself; give seeds="),
 ]
 

@@ -39,7 +39,7 @@ WRONG = {
     ("table1", "data=cap"): "table1 is made on data=builtin or dfaust, got 'cap'",
     ("table1", "subjects=[50003]"): "no subject '50003'; did you mean '500",
     ("table1", "extra=[training.stps=1]"): "row pose_onet: unknown setting 'training.stps'; did you mean 'training.steps'?",
-    ("table1", "launcher=slurm"): "launcher must be basic or joblib",
+    ("table1", "launcher=slurm"): "launcher: wanted basic, joblib",
     ("table1", "processes=2"): "launcher=basic runs one job at a time, got processes=2",
     ("table1", "launcher_settings=[gpu]"): "launcher_settings: wanted settings such as [partition=gpu], got 'gpu'",
     ("table1", "table2"): "'table2' is no setting",

@@ -132,16 +132,16 @@ def test_cells_follow_the_learned_shape(config_for, store):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"name": "mesh"}, "skinning.name must be distilled or voxel or mlp or preset, got 'mesh'"),
-        ({"softmax": "flat"}, "skinning.softmax must be plain or hierarchical, got 'flat'"),
+        ({"name": "mesh"}, "skinning.name: wanted distilled, voxel, mlp or preset, got 'mesh'"),
+        ({"softmax": "flat"}, "skinning.softmax: wanted plain or hierarchical, got 'flat'"),
         ({"name": "mlp"}, "skinning=mlp has no cells to search"),
         ({"name": "preset"}, "skinning=preset needs skinning.weights_file=FILE"),
         ({"name": "preset", "weights_file": "nowhere.npz"}, "no weights file at nowhere.npz"),
         ({"weights_file": "some.npz"}, "skinning.weights_file is for skinning=preset"),
         ({"smoothness": 0.1}, "skinning.smoothness is for skinning=voxel"),
-        ({"name": "voxel", "smoothness": -1.0}, "skinning.smoothness must be at least 0, got -1.0"),
-        ({"prior_falloff_m": 0.0}, "skinning.prior_falloff_m must be positive"),
-        ({"resolution": [8, 8]}, "skinning.resolution must be three numbers"),
+        ({"name": "voxel", "smoothness": -1.0}, "skinning.smoothness: wanted at least 0, got -1.0"),
+        ({"prior_falloff_m": 0.0}, "skinning.prior_falloff_m: wanted a positive number"),
+        ({"resolution": [8, 8]}, "skinning.resolution: wanted three numbers"),
     ],
 )
 def test_settings_that_do_not_fit_make_nothing(config_for, changes, message):

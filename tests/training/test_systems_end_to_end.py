@@ -125,13 +125,13 @@ def test_settings_of_a_system_that_cannot_be_used_are_refused(config_for):
     with pytest.raises(UserError, match="model=snarf has no cells to search; leave search out"):
         run(replace(config, search=SearchConfig("complete")))
     for name, value in (("part_points", 0), ("part_width", 0), ("part_code", -1), ("part_weight", math.nan)):
-        with pytest.raises(UserError, match=f"model.{name} must be at least"):
+        with pytest.raises(UserError, match=f"model.{name}: wanted at least"):
             run(replace(config, model=ModelConfig("nasa", **{name: value})))
     config = config_for("fast_snarf")
     for condition in (ConditionConfig("local", layer=config.shape.depth), ConditionConfig("global", layer=-1)):
-        with pytest.raises(UserError, match=f"condition.layer must be between 0 and {config.shape.depth - 1}"):
+        with pytest.raises(UserError, match=f"condition.layer: wanted 0 to {config.shape.depth - 1}"):
             run(replace(config, condition=condition))
-    with pytest.raises(UserError, match=r"condition.size must be at least 1, got 0"):
+    with pytest.raises(UserError, match=r"condition.size: wanted at least 1, got 0"):
         run(replace(config, condition=ConditionConfig("local", size=0)))
     assert not Path(config.output_root).exists()
 

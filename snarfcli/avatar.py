@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from snarfcli.export.character import CharacterOptions
+from snarfcli.export.clips import Clip
 from snarfcli.export.export import ExportReport, export_character
-from snarfcli.export.rig import Clip
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.posed import posed_mesh
 from snarfcli.meshing.skinned import SkinnedSurface, skinned_surface

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid
-from snarfcli.export.rig import Clip
+from snarfcli.export.clips import Clip
 from snarfcli.motions import Motion
 
 JOINTS = 6

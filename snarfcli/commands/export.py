@@ -23,9 +23,10 @@ from snarfcli.commands.selection import (
 )
 from snarfcli.errors import UserError
 from snarfcli.export.blender import BLENDER_FORMATS, convert, find_blender
-from snarfcli.export.character import CharacterOptions, character_surface, check_avatar, check_options
+from snarfcli.export.character import CharacterOptions, check_options
+from snarfcli.export.character_surface import character_surface, check_avatar
+from snarfcli.export.clips import HEIGHTS, Clip, on_ground
 from snarfcli.export.export import ExportReport, check_output, export_character
-from snarfcli.export.rig import HEIGHTS, Clip, on_ground
 from snarfcli.export.sequence import atomic_folder, check_folder, write_sequence
 from snarfcli.files import write_json
 from snarfcli.meshing.mesh_files import MESH_WRITERS

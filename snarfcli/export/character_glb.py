@@ -20,12 +20,12 @@ from snarfcli.meshing.mesh import vertex_normals
 
 __all__ = ["write_character"]
 
-# Linear, as glTF has it: a light clay on which shading shows; the weights' colours need white below them.
+# Linear RGBA, as in glTF. Clay is light enough to show shading; it multiplies the colours of weights, so these need white.
 _CLAY = (0.62, 0.50, 0.42, 1.0)
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 _ROUGHNESS = 0.75
 _MOVES = {"translation": 1e-6, "rotation": 1e-7, "scale": 1e-6}
-"""Paths of a node's channels, and how far values may be from the node's own to be the same up to rounding (metres, 1, 1)."""
+"""Paths of the channels of a node, and the largest difference from the value of the node that is rounding (metres, 1, 1)."""
 
 
 def write_character(
@@ -40,20 +40,20 @@ def write_character(
 ) -> int:
     """Write a character, whole or not at all.
 
-    The nodes: one with the skinned mesh, one above all joints, and the joints, in the canonical pose. y is up, the root joint
-    carries the translation, units are metres. A mesh with morph targets names them in `extras.targetNames`.
+    Nodes: the skinned mesh, a parent of all joints, and the joints in the canonical pose. y is up, the root joint has the
+    translation of the motion, units are metres. `extras.targetNames` of the mesh names the morph targets.
 
     Args:
         path: the file.
-        character: what it holds.
-        joint_names: J names of nodes.
-        parents: J parents, -1 for a root.
-        name: of the mesh, and of the node above the joints.
+        character: the content of the file.
+        joint_names: names of the J joints.
+        parents: parents of the J joints, -1 for a root.
+        name: name of the mesh; the parent of all joints is called `name_rig`.
         weight_colors: whether vertices are coloured by their weights.
-        facts: for `asset.extras`.
+        facts: content of `asset.extras`.
 
     Returns:
-        Its size in bytes.
+        Size of the file in bytes.
     """
     builder = GlbBuilder(**(facts or {}))
     roots = [2 + joint for joint, parent in enumerate(parents) if parent < 0]
@@ -82,7 +82,7 @@ def write_character(
         skeleton=armature,
     )
     moving = {path: _moving(character.clips, path, getattr(rest, path)[0]) for path in _MOVES}
-    # A clip needs a channel, which also says how long it is.
+    # A clip needs at least one channel, which also gives its length.
     moving["translation"][roots[0] - first] = moving["rotation"][roots[0] - first] = True
     for clip in character.clips:
         _add_clip(builder, clip, moving, first, mesh_node if len(character.shapes.targets) else None)
@@ -90,8 +90,10 @@ def write_character(
 
 
 def _add_mesh(builder: GlbBuilder, character: Character, name: str, weight_colors: bool) -> int:
-    """Add the mesh with its attributes, morph targets and material; return its number."""
+    """Add the mesh with its attributes, morph targets and material; return its index."""
     mesh = character.mesh
+    assert mesh.normals is not None
+    assert mesh.weights is not None
     attributes = {
         "POSITION": builder.array(mesh.vertices, target=ARRAY_BUFFER, bounds=True),
         "NORMAL": builder.array(_units(mesh.normals), target=ARRAY_BUFFER),
@@ -113,7 +115,7 @@ def _add_mesh(builder: GlbBuilder, character: Character, name: str, weight_color
                 "NORMAL": builder.array(bent, target=ARRAY_BUFFER),
             }
         )
-    index_type = "uint16" if len(mesh.vertices) < 2**16 else "uint32"  # the largest number means something else
+    index_type = "uint16" if len(mesh.vertices) < 2**16 else "uint32"  # 65535 is reserved
     material = builder.add(
         "materials",
         name="weights" if weight_colors else "clay",
@@ -141,7 +143,7 @@ def _add_mesh(builder: GlbBuilder, character: Character, name: str, weight_color
 def _add_clip(
     builder: GlbBuilder, clip: CharacterClip, moving: dict[str, NDArray[np.bool_]], first: int, mesh_node: int | None
 ) -> None:
-    """Add an animation; channels that stand still keep their first and last key."""
+    """Add an animation; constant channels keep their first and last key only."""
     count = len(clip.joints.rotation)
     times = np.arange(count) / clip.frame_rate
     time_arrays: dict[int, int] = {}
@@ -170,31 +172,30 @@ def _add_clip(
 
 
 def _moving(clips: Sequence[CharacterClip], path: str, rest: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which joints [J] leave what their nodes say, in any clip: those need a channel in every one.
+    """Return which joints [J] differ from the values of their nodes in any clip: these need a channel in every clip.
 
-    Else a program that goes from one clip to the next would keep what the one before left behind.
+    Otherwise a program that changes from one clip to the next would keep the values of the first.
     """
     away = np.zeros(len(rest), dtype=bool)
     for clip in clips:
         values = getattr(clip.joints, path)
         difference = np.abs(values - rest)
-        if path == "rotation":  # the other sign is the same turn
+        if path == "rotation":  # the other sign is the same rotation
             difference = np.minimum(difference.max(-1), np.abs(values + rest).max(-1))[..., None]
         away |= (difference > _MOVES[path]).any(axis=(0, 2))
     return away
 
 
 def _linear(colors: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return sRGB colours [V, 3] as linear ones with alpha, [V, 4] from 0 to 65535 (glTF 2.0, 3.7.2.1: linear)."""
+    """Return sRGB colours [V, 3] as linear RGBA [V, 4] from 0 to 65535 (glTF 2.0, 3.7.2.1: linear)."""
     return np.rint(65535 * np.hstack([from_srgb(colors), np.ones((len(colors), 1))]))
 
 
 def _units(normals: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return normals of length 1 to the last bit of float32."""
-    normals = normals.astype(np.float64)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    """Return normals [V, 3] of length 1 to the precision of float32."""
+    return normals / np.linalg.norm(normals.astype(np.float64), axis=1, keepdims=True)
 
 
-def _numbers(values: NDArray[np.float64]) -> list[float]:
-    """Return numbers for JSON that float32 reads back as it rounds them."""
+def _numbers(values: NDArray) -> list[float]:
+    """Return numbers for JSON, rounded to float32, without negative zeros."""
     return [float(value) + 0.0 for value in values.astype(np.float32)]

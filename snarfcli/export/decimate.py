@@ -1,4 +1,4 @@
-"""Meshes with fewer triangles."""
+"""Reduce the number of triangles of a mesh."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ __all__ = ["decimate"]
 
 
 def decimate(mesh: Mesh, triangles: int) -> Mesh:
-    """Return a mesh of at most so many triangles, without attributes; the mesh itself if it has no more.
+    """Return a mesh of at most `triangles` triangles, without attributes; the same mesh if it has no more.
 
-    Edges are collapsed where that changes the surface least (Garland and Heckbert, Surface simplification using quadric error
-    metrics, SIGGRAPH 1997), by MeshLab.
+    MeshLab collapses the edges that change the surface least (Garland and Heckbert, Surface simplification using quadric error
+    metrics, SIGGRAPH 1997).
 
     Raises:
-        ValueError: so few triangles are not enough for this surface.
+        ValueError: the surface cannot have so few triangles without changing its topology.
     """
     if len(mesh.faces) <= triangles:
         return mesh
     import pymeshlab
 
-    meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.Mesh(mesh.vertices.astype(np.float64), mesh.faces))
+    # pymeshlab fills its module from a compiled one, which type checkers do not see.
+    meshes = pymeshlab.MeshSet(verbose=False)  # pyright: ignore[reportAttributeAccessIssue]
+    corners = mesh.vertices.astype(np.float64)
+    meshes.add_mesh(pymeshlab.Mesh(corners, mesh.faces))  # pyright: ignore[reportAttributeAccessIssue]
     meshes.meshing_decimation_quadric_edge_collapse(
         targetfacenum=triangles,
-        preservetopology=True,  # a hole or a hair-thin bridge would show when the mesh bends
+        preservetopology=True,  # a hole or a thin bridge would show when the mesh bends
         preservenormal=True,
         optimalplacement=True,
-        planarquadric=True,  # evener triangles where the surface is flat, which bend better
+        planarquadric=True,  # more regular triangles on flat parts, which bend better
         autoclean=True,
     )
     result = meshes.current_mesh()
-    if result.face_number() > triangles:  # what keeps the topology has an end
+    if result.face_number() > triangles:  # the topology needs more
         raise ValueError(
-            f"the surface cannot have fewer than {result.face_number()} triangles without tearing, got triangles={triangles}"
+            f"triangles: wanted at least {result.face_number()} for this surface, got {triangles}; fewer would tear it"
         )
     return Mesh(result.vertex_matrix(), result.face_matrix())

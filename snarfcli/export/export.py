@@ -1,4 +1,4 @@
-"""Exporting an avatar with its motions, and what is said about it afterwards."""
+"""Export an avatar and its motions as a character file, and report its size and accuracy."""
 
 from __future__ import annotations
 
@@ -6,21 +6,15 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from snarfcli.errors import UserError
-from snarfcli.export.character import (
-    Character,
-    CharacterOptions,
-    build_character,
-    character_surface,
-    check_options,
-)
+from snarfcli.export.character import Character, CharacterOptions, check_options
+from snarfcli.export.character_build import build_character
 from snarfcli.export.character_glb import write_character
-from snarfcli.export.rig import Clip
-
-if TYPE_CHECKING:
-    from snarfcli.models.trained_field import TrainedField
+from snarfcli.export.character_surface import character_surface
+from snarfcli.export.clips import Clip
+from snarfcli.models.trained_field import TrainedField
 
 __all__ = ["ClipReport", "ExportReport", "check_output", "export_character"]
 
@@ -34,54 +28,54 @@ class ClipReport:
     name: str
     frames: int
     frame_rate: float
-    """Frames a second."""
+    """Frames per second."""
 
     @property
     def seconds(self) -> float:
-        """From the first frame to the last."""
+        """Time from the first frame to the last."""
         return (self.frames - 1) / self.frame_rate
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was written, and how near it comes to the avatar's skinned surface. Distances are over all vertices and frames."""
+    """Size of a character file, and its distances from the skinned surface of the avatar, over all vertices and frames."""
 
     path: Path
     """The file."""
     num_bytes: int
-    """Its size."""
+    """Size of the file."""
     vertices: int
     triangles: int
     joints: int
     influences: int
-    """Joints that move one vertex, at most."""
+    """Maximum number of joints per vertex."""
     truncation_mm: dict[str, float]
-    """What few influences cost: max_mm, p99_mm, rms_mm."""
+    """Error of the reduced number of influences: max_mm, p99_mm, rms_mm."""
     morph_targets: int
-    """Shapes for the pose-dependent shape."""
+    """Number of morph targets for the pose-dependent shape."""
     morph_error_mm: dict[str, float]
-    """What they leave of it."""
+    """Error of the morph targets."""
     shape_motion_mm: dict[str, float]
-    """How far the pose-dependent shape is from its mean."""
+    """Distance of the pose-dependent shape from its mean."""
     deviation_mm: dict[str, float]
-    """All errors together: the posed character against the avatar's skinned surface with the same triangles."""
+    """Total error: the posed character against the skinned surface of the avatar with the same triangles."""
     clips: tuple[ClipReport, ...]
     skipped: tuple[tuple[str, int, str], ...] = ()
-    """Clip, frame and reason where the shape could not be followed and is blended from the frames around."""
+    """Clip, frame and reason of frames whose shape could not be followed; it is interpolated from the frames around."""
 
     @property
     def morph_share(self) -> float:
-        """Share of the pose-dependent shape's variance that the morph targets explain, 0 to 1; 1 where there is none."""
+        """Share of the variance of the pose-dependent shape that the morph targets explain, 0 to 1; 1 for a constant shape."""
         whole = self.shape_motion_mm["rms_mm"]
         return 1 - (self.morph_error_mm["rms_mm"] / whole) ** 2 if whole > 0 else 1.0
 
     def facts(self) -> dict[str, Any]:
-        """Return everything but the path and the size, for records."""
+        """Return all fields except the path and the size, for records."""
         facts = {**asdict(self), "morph_share": round(self.morph_share, 4)}
         return {name: value for name, value in facts.items() if name not in ("path", "num_bytes")}
 
     def lines(self) -> list[str]:
-        """Return the report for people."""
+        """Return the report as lines of text."""
         moved, left = self.shape_motion_mm, self.morph_error_mm
         clips = ", ".join(f"{c.name} ({c.frames} frames, {c.seconds:.2f} s at {c.frame_rate:g})" for c in self.clips)
         return [
@@ -106,21 +100,21 @@ def export_character(
     """Write a rigged, animated character as `.glb`, whole or not at all.
 
     Args:
-        avatar: with skinning weights.
+        avatar: an avatar with skinning weights.
         path: the file.
         clips: motions, at least one.
-        options: what it may cost.
-        name: of the mesh; the avatar's subject by default.
-        overwrite: whether a file that is there already is replaced.
+        options: limits on the size of the character.
+        name: name of the mesh; by default the subject of the avatar.
+        overwrite: whether an existing file is replaced.
 
     Raises:
-        UserError: a setting cannot be used, the file is there already, or the avatar has no weights or no surface.
+        UserError: an option is out of range, the file exists, or the avatar has no weights or no surface.
     """
     check_options(options)
     path = Path(path)
     check_output(path, overwrite)
     if not clips:
-        raise UserError("no motion to export; give at least one")
+        raise UserError("clips: wanted at least one motion to export, got none; give a motion")
     surface = character_surface(avatar, options)
     character = build_character(avatar, surface, clips, options)
     report = _report(path, character, options)
@@ -137,19 +131,19 @@ def export_character(
 
 
 def check_output(path: Path, overwrite: bool) -> None:
-    """Refuse a file or folder that is there already.
+    """Check that a file can be written.
 
     Raises:
-        UserError: it is there, and is not to be replaced or is of another kind.
+        UserError: the path is a folder, or it exists and `overwrite` is False.
     """
     if path.is_dir():
-        raise UserError(f"{path} is a folder; name a file")
+        raise UserError(f"{path}: wanted a file, got a folder; give the name of a file")
     if path.exists() and not overwrite:
-        raise UserError(f"{path} is there already; give overwrite=true to replace it, or output=FILE")
+        raise UserError(f"{path} exists already; give overwrite=true to replace it, or output=FILE")
 
 
 def _report(path: Path, character: Character, options: CharacterOptions, size: int = 0) -> ExportReport:
-    """Return what is known of a character."""
+    """Return the report of a character."""
     return ExportReport(
         path=path,
         num_bytes=size,
@@ -157,16 +151,16 @@ def _report(path: Path, character: Character, options: CharacterOptions, size: i
         triangles=len(character.mesh.faces),
         joints=len(character.bind),
         influences=options.influences,
-        truncation_mm=character.truncation.facts(),
+        truncation_mm=character.errors.truncation.facts(),
         morph_targets=len(character.shapes.targets),
-        morph_error_mm=character.shape_error.facts(),
-        shape_motion_mm=character.shape_motion.facts(),
-        deviation_mm=character.deviation.facts(),
+        morph_error_mm=character.errors.shape_error.facts(),
+        shape_motion_mm=character.errors.shape_motion.facts(),
+        deviation_mm=character.errors.deviation.facts(),
         clips=tuple(ClipReport(c.name, len(c.joints.rotation), c.frame_rate) for c in character.clips),
         skipped=tuple(character.skipped),
     )
 
 
 def _millimetres(facts: dict[str, float]) -> str:
-    """Return an error as text."""
+    """Return an error as text, in millimetres."""
     return f"{facts['rms_mm']:.2f} mm (rms), 99 % below {facts['p99_mm']:.2f} mm, {facts['max_mm']:.2f} mm at most"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from snarfcli.errors import UserError
-from snarfcli.export.rig import Clip
+from snarfcli.export.clips import Clip
 from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh_files import MESH_WRITERS

@@ -15,8 +15,8 @@ from toy_character import JOINTS, ToyCharacter, wave
 from snarfcli.errors import UserError
 from snarfcli.export.blender import convert, find_blender
 from snarfcli.export.character import CharacterOptions
+from snarfcli.export.clips import Clip
 from snarfcli.export.export import export_character
-from snarfcli.export.rig import Clip
 
 try:
     BLENDER = find_blender()

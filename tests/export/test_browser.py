@@ -18,8 +18,8 @@ from glb_reader import READERS, SCRIPTS, needs_readers
 from toy_character import FRAME_RATE, ToyCharacter, wave
 
 from snarfcli.export.character import CharacterOptions
+from snarfcli.export.clips import Clip
 from snarfcli.export.export import export_character
-from snarfcli.export.rig import Clip
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FRAMES = (0, 5, 11)

@@ -15,9 +15,10 @@ from toy_character import BULGE, FRAME_RATE, JOINTS, ToyCharacter, stretched, wa
 from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.errors import UserError
 from snarfcli.export import character_glb
-from snarfcli.export.character import CharacterOptions, character_surface
+from snarfcli.export.character import CharacterOptions
+from snarfcli.export.character_surface import character_surface
+from snarfcli.export.clips import Clip
 from snarfcli.export.export import export_character
-from snarfcli.export.rig import Clip
 from snarfcli.formats.gltf import read_gltf
 from snarfcli.meshing.extract import EmptySurface
 from snarfcli.meshing.skinned import SkinnedSurface
@@ -305,7 +306,7 @@ def test_whole_or_not_at_all(toy, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
     monkeypatch.undo()
     path.write_bytes(b"mine")
-    with pytest.raises(UserError, match=r"worm.glb is there already; give overwrite=true"):
+    with pytest.raises(UserError, match=r"worm.glb exists already; give overwrite=true"):
         export_character(toy, path, [Clip(wave(2))], FEW)
     assert path.read_bytes() == b"mine"
     export_character(toy, path, [Clip(wave(2))], FEW, overwrite=True)
@@ -316,7 +317,7 @@ def test_whole_or_not_at_all(toy, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"influences": 3}, "influences must be 4 or 8, got 3"),
+        ({"influences": 3}, "influences: wanted 4 or 8, got 3"),
         ({"triangles": 5}, "triangles: wanted 100 to 5000000, got 5"),
         ({"triangles": 10**8}, "triangles: wanted 100 to"),
         ({"morph_targets": -1}, "morph_targets: wanted 0 to 64, got -1"),
@@ -330,7 +331,7 @@ def test_what_can_be_wrong(toy, tmp_path, change, message):
 
 
 def test_without_weights_or_motions_there_is_no_character(toy, tmp_path, monkeypatch):
-    with pytest.raises(UserError, match="no motion to export"):
+    with pytest.raises(UserError, match="clips: wanted at least one motion to export, got none"):
         export_character(toy, tmp_path / "worm.glb", [], FEW)
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
     with pytest.raises(

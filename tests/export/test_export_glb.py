@@ -50,9 +50,9 @@ def test_one_motion_or_clip_will_do(avatar, tmp_path):
     assert report.morph_targets == 0
     again = avatar.export_glb(tmp_path / "b.glb", stretched(wave(2), ToyCharacter()), **few)
     assert again.clips[0].frames == 2
-    with pytest.raises(UserError, match=r"a.glb is there already"):
+    with pytest.raises(UserError, match=r"a.glb exists already"):
         avatar.export_glb(tmp_path / "a.glb", wave(2), **few)
-    with pytest.raises(ValueError, match="influences must be 4 or 8, got 5"):
+    with pytest.raises(ValueError, match="influences: wanted 4 or 8, got 5"):
         avatar.export_glb(tmp_path / "c.glb", wave(2), influences=5)
-    with pytest.raises(ValueError, match="no motion to export"):
+    with pytest.raises(ValueError, match="clips: wanted at least one motion to export"):
         avatar.export_glb(tmp_path / "c.glb", [])

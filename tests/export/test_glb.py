@@ -71,5 +71,5 @@ def test_what_cannot_be_stored(values, options, message):
 def test_numbers_of_json_are_numbers():
     builder = GlbBuilder()
     builder.add("nodes", translation=[float("nan")] * 3)
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="not JSON compliant"):
         builder.to_bytes()

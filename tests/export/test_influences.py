@@ -7,8 +7,8 @@ import pytest
 from toy_character import ToyCharacter, wave
 
 from snarfcli.bodies.skinning import skin_vertices
+from snarfcli.export.clips import Clip, clip_transforms
 from snarfcli.export.influences import dense_weights, few_influences, trial_poses
-from snarfcli.export.rig import Clip, clip_transforms
 
 TOY = ToyCharacter(spread=0.16)
 MESH = TOY.skinned_surface(32).mesh

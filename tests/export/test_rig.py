@@ -7,14 +7,8 @@ from scipy.spatial.transform import Rotation
 from toy_character import BONE, JOINTS, ToyCharacter, stretched, wave
 
 from snarfcli.bodies.skinning import skin_vertices
-from snarfcli.export.rig import (
-    Clip,
-    bind_frames,
-    clip_transforms,
-    decompose,
-    local_frames,
-    recompose,
-)
+from snarfcli.export.clips import Clip, clip_transforms
+from snarfcli.export.rig import bind_frames, decompose, local_frames, recompose
 
 TOY = ToyCharacter()
 PARENTS = TOY.skeleton.parents

@@ -7,7 +7,7 @@ import pytest
 from toy_character import ToyCharacter, wave
 
 from snarfcli.bodies.skinning import skin_vertices
-from snarfcli.export.rig import Clip, clip_transforms, lowest_point, on_ground
+from snarfcli.export.clips import Clip, clip_transforms, lowest_point, on_ground
 
 TOY = ToyCharacter()
 MESH = TOY.skinned_surface(32).mesh

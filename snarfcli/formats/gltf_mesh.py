@@ -1,4 +1,4 @@
-"""Triangles of glTF files, with the joints that each vertex follows.
+"""Read the triangles of glTF files, with the joints and weights of each vertex.
 
 Source: Khronos, glTF 2.0 specification, section 3.7 (geometry, skins).
 """
@@ -18,7 +18,7 @@ __all__ = ["MeshReader", "Piece", "dense_weights", "join_pieces", "moved", "weld
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _DRACO = "KHR_draco_mesh_compression"
 _MAX_PRIMITIVES = 10_000
-# Half a GiB and 3 s, with eight joints to each vertex.
+# 512 MiB and 3 s, with eight joints per vertex.
 _MAX_VERTICES = 500_000
 _MAX_FACES = 1_000_000
 _MAX_WEIGHTS = 40_000_000  # 320 MB
@@ -26,20 +26,20 @@ _MAX_WEIGHTS = 40_000_000  # 320 MB
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Triangles whose vertices follow up to K joints each."""
+    """Triangles whose vertices follow at most K joints each."""
 
     vertices: NDArray[np.float64]
-    """[V, 3]."""
+    """[V, 3], positions."""
     faces: NDArray[np.int64]
-    """[F, 3]."""
+    """[F, 3], triangles."""
     joints: NDArray[np.int64]
-    """[V, K] which joints; K may be 0."""
+    """[V, K], indices of joints; K may be 0."""
     weights: NDArray[np.float64]
-    """[V, K] how much: non-negative, rows sum to 1, sorted by joint, unused ones last with joint and weight 0."""
+    """[V, K], weights of these joints: non-negative, rows sum to 1, sorted by joint; unused entries are 0 and come last."""
 
 
 class MeshReader:
-    """Reads meshes of one file, each once, and keeps count of what it hands out."""
+    """Reader of the meshes of one file; reads each once, and limits the total size of the results."""
 
     def __init__(self, file: GltfFile) -> None:
         self._file = file
@@ -47,21 +47,22 @@ class MeshReader:
         self._vertices = self._faces = self._primitives = 0
 
     def read(self, number: int, skin_joints: int | None) -> Piece:
-        """Read all triangles of mesh `number`, as stored; left out are points, lines, and vertices that no triangle uses.
+        """Read all triangles of a mesh, as stored. Points, lines, and vertices that no triangle uses are left out.
 
         Args:
-            number: which mesh.
-            skin_joints: joints of the skin that moves it; None reads no joints, K is then 0.
+            number: index of the mesh.
+            skin_joints: number of joints of the skin that moves it; None reads no joints, and K is 0.
 
         Raises:
-            UserError: broken numbers, numbers out of range, far too many vertices, vertices without joints in a skinned mesh.
+            UserError: values are damaged or out of range, there are too many vertices, or vertices of a skinned mesh have no
+                joints.
         """
         file, what = self._file, f"mesh {number}"
         if (number, skin_joints) not in self._pieces:
             primitives = file.objects(file.items("meshes")[number], "primitives", what)
             self._primitives += len(primitives)
             if self._primitives > _MAX_PRIMITIVES:
-                file.fail(f"its meshes have over {_MAX_PRIMITIVES} parts; join them")
+                file.fail(f"wanted at most {_MAX_PRIMITIVES} parts of meshes, got more; join them")
             pieces = []
             for primitive in primitives:
                 piece = _read_primitive(file, primitive, skin_joints, what)
@@ -77,7 +78,9 @@ class MeshReader:
         self._vertices += len(piece.vertices)
         self._faces += len(piece.faces)
         if self._vertices > _MAX_VERTICES or self._faces > _MAX_FACES:
-            self._file.fail(f"its meshes have over {_MAX_VERTICES} vertices or {_MAX_FACES} triangles; simplify them")
+            self._file.fail(
+                f"wanted meshes of at most {_MAX_VERTICES} vertices and {_MAX_FACES} triangles, got more; simplify them"
+            )
 
 
 def _read_primitive(file: GltfFile, primitive: dict[str, Any], skin_joints: int | None, what: str) -> Piece | None:
@@ -86,20 +89,20 @@ def _read_primitive(file: GltfFile, primitive: dict[str, Any], skin_joints: int 
     if mode not in (_TRIANGLES, _STRIP, _FAN) or not isinstance(attributes, dict) or "POSITION" not in attributes:
         return None
     if file.has_extension(primitive, _DRACO):
-        number = file.index(attributes, "POSITION", "accessors", what)
+        number = file.checked_index(attributes["POSITION"], "accessors", f"POSITION of {what}")
         if "bufferView" not in file.items("accessors")[number]:
-            file.fail(f"{what} is compressed with Draco, which is not read; export it without compression")
+            file.fail(f"{what} is compressed with Draco, which is not supported; export it without compression")
     vertices = _attribute(file, attributes, "POSITION", ("VEC3",), None, what).astype(np.float64)
     indices = file.index(primitive, "indices", "accessors", what)
     if indices is None:
         corners = np.arange(len(vertices))
     else:
         if file.accessor_shape(indices)[0] > 3 * _MAX_FACES:
-            file.fail(f"{what} has over {_MAX_FACES} triangles; simplify it")
+            file.fail(f"{what}: wanted at most {_MAX_FACES} triangles, got more; simplify it")
         corners = file.accessor(indices, ("SCALAR",), f"indices of {what}")[:, 0]
         if corners.dtype.kind != "i" or (len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices)):
             file.fail(f"{what} has indices beyond its {len(vertices)} vertices; export it again")
-    faces = _triangles(corners, mode)
+    faces = _triangles(corners.astype(np.int64, copy=False), mode)
     used, inverse = np.unique(faces, return_inverse=True)
     joints, weights = np.zeros((len(vertices), 0), np.int64), np.zeros((len(vertices), 0))
     if skin_joints is not None:
@@ -112,17 +115,17 @@ def _attribute(
 ) -> NDArray:
     number = file.index(attributes, name, "accessors", what)
     if number is None:
-        file.fail(f"{what} has no {name}, though a skin moves it; export it again")
+        file.fail(f"{what} has no {name}, but a skin moves it; export it again")
     if file.accessor_shape(number)[0] > _MAX_VERTICES:
-        file.fail(f"{what} has over {_MAX_VERTICES} vertices; simplify it")
+        file.fail(f"{what}: wanted at most {_MAX_VERTICES} vertices, got more; simplify it")
     values = file.accessor(number, wanted, f"{name} of {what}")
     if count is not None and len(values) != count:
-        file.fail(f"{what} has {count} vertices and {len(values)} of {name}; export it again")
+        file.fail(f"{what}: wanted {count} values of {name}, one per vertex, got {len(values)}; export it again")
     return values
 
 
 def _triangles(corners: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
-    """Return [F, 3], all with the same turn."""
+    """Return the triangles [F, 3] of a list, strip or fan of corners, all with the same orientation."""
     if mode == _TRIANGLES:
         return corners[: len(corners) // 3 * 3].reshape(-1, 3)
     count = max(0, len(corners) - 2)
@@ -142,17 +145,17 @@ def _read_weights(
     weights = np.maximum(np.concatenate(parts, 1).astype(np.float64), 0.0)
     joints = np.where(weights > 0, joints, 0)
     if joints.dtype.kind != "i" or (joints.size and not 0 <= joints.min() <= joints.max() < skin_joints):
-        file.fail(f"{what} names a joint beyond the {skin_joints} of its skin; export it again")
-    # Sorted, so that vertices that were split for a seam have the same sums and rows, to the last bit.
+        file.fail(f"{what} refers to a joint beyond the {skin_joints} of its skin; export it again")
+    # Sorted, so that vertices split along a seam have bitwise equal rows and sums.
     order = np.argsort(np.where(weights > 0, joints, skin_joints), axis=1, kind="stable")
     joints, weights = np.take_along_axis(joints, order, 1), np.take_along_axis(weights, order, 1)
     total = weights.sum(1, keepdims=True)
-    weights[:, :1] = np.where(total > 0, weights[:, :1], 1.0)  # follows nothing: hold on to the first joint, as viewers do
+    weights[:, :1] = np.where(total > 0, weights[:, :1], 1.0)  # vertices without weights follow the first joint, as in viewers
     return joints, weights / np.where(total > 0, total, 1.0)
 
 
 def join_pieces(pieces: list[Piece]) -> Piece:
-    """Return all pieces as one."""
+    """Return all pieces as one piece."""
     counts = [len(piece.vertices) for piece in pieces]
     width = max((piece.joints.shape[1] for piece in pieces), default=0)
     starts = np.cumsum([0, *counts])
@@ -169,18 +172,18 @@ def join_pieces(pieces: list[Piece]) -> Piece:
 
 
 def moved(piece: Piece, matrix: NDArray[np.float64]) -> Piece:
-    """Return the piece moved by an affine matrix [4, 4]; one that mirrors turns the triangles round, so outside stays out."""
+    """Return the piece moved by an affine matrix [4, 4]; a mirroring matrix reverses the triangles, so normals stay outward."""
     faces = piece.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else piece.faces
     return replace(piece, vertices=piece.vertices @ matrix[:3, :3].T + matrix[:3, 3], faces=faces)
 
 
 def welded(piece: Piece) -> Piece:
-    """Merge vertices that have the same position and weights, and drop the triangles that lose their area by it.
+    """Merge vertices of equal position and weights, and drop the triangles that become degenerate.
 
-    glTF splits vertices where a normal or a texture coordinate jumps; welded, a closed surface is closed again. What lies in
-    the same place but follows other joints (two parts that touch) stays apart.
+    glTF splits vertices where a normal or a texture coordinate is discontinuous; welding closes the surface again. Vertices at
+    the same position that follow different joints (two parts that touch) are not merged.
     """
-    rows = np.concatenate([piece.vertices, piece.joints, piece.weights], 1) + 0.0  # + 0.0 makes -0.0 the same as 0.0
+    rows = np.concatenate([piece.vertices, piece.joints, piece.weights], 1) + 0.0  # + 0.0 turns -0.0 into 0.0
     keys = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1])))[:, 0]
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     faces = first[inverse.reshape(-1)][piece.faces]
@@ -191,14 +194,14 @@ def welded(piece: Piece) -> Piece:
 
 
 def dense_weights(file: GltfFile, piece: Piece, num_joints: int) -> NDArray[np.float64]:
-    """Return the weights as [V, J].
+    """Return the weights of all joints, [V, J].
 
     Raises:
-        UserError: that would be far too many.
+        UserError: the array would be too large.
     """
     count = len(piece.vertices)
     if count * num_joints > _MAX_WEIGHTS:
-        file.fail(f"has {count} vertices and {num_joints} joints, more than can be read together; simplify the mesh")
+        file.fail(f"wanted at most {_MAX_WEIGHTS} weights, got {count} vertices times {num_joints} joints; simplify the mesh")
     dense = np.zeros((count, num_joints))
     rows = np.arange(count)
     for column in range(piece.joints.shape[1]):

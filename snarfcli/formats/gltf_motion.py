@@ -1,4 +1,4 @@
-"""Animations of glTF files, sampled at equal times.
+"""Read the animations of glTF files, sampled at equal time steps.
 
 Source: Khronos, glTF 2.0 specification, section 3.11 and appendix C (interpolation).
 """
@@ -18,45 +18,45 @@ __all__ = ["GltfAnimation", "read_animations"]
 _WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 _MAX_CHANNELS = 30_000
 _MAX_FRAMES = 100_000
-# Of all animations together: frames times channels. A minute of 100 joints at 30 frames a second is half a million.
+# Frames times channels, of all animations. One minute of 100 joints at 30 frames per second is half a million.
 _MAX_SAMPLES = 5_000_000
-_MAX_NODE_FRAMES = 1_500_000  # less than `read_gltf` takes
-_USUAL_RATE = 30.0
-_SAID_RATES = (1.0, 1000.0)
-# What is keyed more rarely is keyed by hand, and what lies between the keys belongs to the motion.
-_SHOWN_RATES = (10.0, 1000.0)
-_OFF_A_FRAME = 0.05  # frames; float32 is off by 0.015 in the fiftieth minute at 60 a second
-# Below it a step counts as none: times are stored as float32.
+_MAX_NODE_FRAMES = 1_500_000  # less than the limit of `read_gltf`
+_DEFAULT_RATE = 30.0
+_DECLARED_RATES = (1.0, 1000.0)
+# Lower key rates come from keys set by hand, where the interpolation between the keys is part of the motion.
+_KEY_RATES = (10.0, 1000.0)
+_MAX_OFFSET = 0.05  # frames between a key and its frame; float32 is off by 0.015 in minute 50 at 60 frames per second
+# Seconds; shorter steps count as zero, since times are stored as float32.
 _EPSILON = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class GltfAnimation:
-    """Some nodes over time."""
+    """Transforms of the moving nodes at equal time steps."""
 
     name: str
-    """Its name in the file, or empty."""
+    """Name in the file; may be empty."""
     frame_rate: float
-    """Frames a second."""
+    """Frames per second."""
     num_frames: int
-    """T, at equal times from the first key to the last."""
+    """Number T of frames, at equal time steps from the first key to the last."""
     nodes: dict[int, dict[str, NDArray[np.float64]]]
-    """For each node that moves, some of `translation` [T, 3], `rotation` [T, 4] (unit quaternions, x y z w), `scale` [T, 3]."""
+    """Per moving node, some of `translation` [T, 3], `rotation` [T, 4] (unit quaternions, x y z w), `scale` [T, 3]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Track:
-    """What is known of an animation before it is sampled."""
+    """The channels of an animation, before sampling."""
 
     name: str
     what: str
-    """How messages call it."""
+    """Name in messages."""
     targets: list[tuple[int, str, dict[str, Any]]]
     """Node, path and sampler of each channel."""
     times: list[NDArray[np.float64]]
-    """Times of the keys of each channel, seconds."""
+    """[K] per channel, times of the keys, seconds."""
     own_rate: float | None
-    """Frames a second on which all keys lie, if that is known."""
+    """Frames per second such that all keys lie on frames; None if unknown."""
 
     @property
     def start(self) -> float:
@@ -69,36 +69,36 @@ class _Track:
         return max(times[-1] for times in self.times) - self.start
 
     def num_frames(self, frame_rate: float) -> int:
-        """Return how many frames there are, the last at most at the last key."""
-        if frame_rate == self.own_rate:  # a long time's float32 may be half a frame early
+        """Return the number of frames; the last frame is not after the last key."""
+        if frame_rate == self.own_rate:  # late times, rounded to float32, may be half a frame early
             return round(self.duration * frame_rate) + 1
         return int(self.duration * frame_rate + _EPSILON * frame_rate + 1e-6) + 1
 
 
 def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[GltfAnimation]:
-    """Sample every animation that moves a node; those of morph targets are left out.
+    """Sample every animation that moves a node; animations of morph targets are left out.
 
     Args:
         file: the file.
-        frame_rate: frames a second; None for each animation's own, or 30 where none is known, or where it is more than that
-            and makes too many frames.
+        frame_rate: frames per second; None for the rate of each animation. The rate is then 30 if none is known, or if the
+            known one is higher and gives too many frames.
 
     Raises:
-        UserError: times that do not increase, broken numbers, or far too many frames.
+        UserError: times do not increase, values are damaged, or there are too many frames.
     """
     tracks = _read_tracks(file)
-    rates = [frame_rate or track.own_rate or _USUAL_RATE for track in tracks]
+    rates = [frame_rate or track.own_rate or _DEFAULT_RATE for track in tracks]
     if frame_rate is None and not _affordable(tracks, rates, len(file.items("nodes"))):
-        rates = [min(rate, _USUAL_RATE) for rate in rates]
+        rates = [min(rate, _DEFAULT_RATE) for rate in rates]
     found, samples = [], 0
     for track, rate in zip(tracks, rates, strict=True):
         start, duration = track.start, track.duration
         if not duration * rate < _MAX_FRAMES:
-            file.fail(f"{track.what} lasts {duration:.6g} s, over {_MAX_FRAMES} frames at {rate:g} a second; cut it")
+            file.fail(f"{track.what}: wanted at most {_MAX_FRAMES} frames, got {duration:.6g} s at {rate:g} per second; cut it")
         frames = track.num_frames(rate)
         samples += frames * len(track.targets)
         if samples > _MAX_SAMPLES:
-            file.fail(f"its animations have over {_MAX_SAMPLES} samples at {rate:g} frames a second; export fewer")
+            file.fail(f"its animations have over {_MAX_SAMPLES} samples at {rate:g} frames per second; export fewer")
         at = start + np.minimum(np.arange(frames) / rate, duration)
         nodes: dict[int, dict[str, NDArray[np.float64]]] = {}
         for (node, path, sampler), keys in zip(track.targets, track.times, strict=True):
@@ -115,7 +115,7 @@ def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[Glt
 
 
 def _read_tracks(file: GltfFile) -> list[_Track]:
-    """Read the channels and times of every animation that moves a node."""
+    """Read the channels and key times of every animation that moves a node."""
     animations = file.items("animations")
     channels = [file.objects(a, "channels", f"animation {n}") for n, a in enumerate(animations)]
     if sum(map(len, channels)) > _MAX_CHANNELS:
@@ -130,26 +130,31 @@ def _read_tracks(file: GltfFile) -> list[_Track]:
         if targets:
             times = [_read_times(file, sampler, what) for _, _, sampler in targets]
             extras = animation.get("extras")
-            said = extras.get("frame_rate") if isinstance(extras, dict) else None
-            tracks.append(_Track(name, what, targets, times, _own_rate(times, said)))
+            declared = extras.get("frame_rate") if isinstance(extras, dict) else None
+            tracks.append(_Track(name, what, targets, times, _own_rate(times, declared)))
     return tracks
 
 
-def _own_rate(times: list[NDArray[np.float64]], said: Any) -> float | None:
-    """Return the frames a second on which all keys lie: what the file says, or what equal steps show; None for neither."""
-    if type(said) in (int, float) and _SAID_RATES[0] <= said <= _SAID_RATES[1] and _fits(times, said):
-        return float(said)
+def _own_rate(times: list[NDArray[np.float64]], declared: Any) -> float | None:
+    """Return the frames per second such that all keys lie on frames; None if unknown.
+
+    Args:
+        times: [K] per channel, times of the keys, seconds.
+        declared: the frame rate that the file declares, if any. It is tried first, then the rate of equally spaced keys.
+    """
+    if type(declared) in (int, float) and _DECLARED_RATES[0] <= declared <= _DECLARED_RATES[1] and _fits(times, declared):
+        return float(declared)
     keys = max(times, key=len)
     length = keys[-1] - keys[0]
     if len(keys) < 3 or not length > 0:
         return None
     rate = float((len(keys) - 1) / length)
     rate = round(rate) if abs(rate - round(rate)) < 1e-3 else rate
-    return float(rate) if _SHOWN_RATES[0] <= rate <= _SHOWN_RATES[1] and _fits(times, rate) else None
+    return float(rate) if _KEY_RATES[0] <= rate <= _KEY_RATES[1] and _fits(times, rate) else None
 
 
 def _fits(times: list[NDArray[np.float64]], rate: float) -> bool:
-    """Return whether all keys lie on frames, and no frame is without a key unless only ends have keys."""
+    """Return whether all keys lie on frames, and every frame has a key; channels with keys at both ends only are exempt."""
     start = min(keys[0] for keys in times)
     last = (max(keys[-1] for keys in times) - start) * rate
     if not last < _MAX_FRAMES:
@@ -158,14 +163,14 @@ def _fits(times: list[NDArray[np.float64]], rate: float) -> bool:
     for keys in times:
         frames = (keys - start) * rate
         nearest = np.rint(frames)
-        if (np.abs(frames - nearest) > _OFF_A_FRAME).any():
+        if (np.abs(frames - nearest) > _MAX_OFFSET).any():
             return False
         taken[nearest.astype(np.int64)] = True
     return bool(taken.all()) or max(map(len, times)) <= 2
 
 
 def _affordable(tracks: list[_Track], rates: list[float], num_nodes: int) -> bool:
-    """Return whether these rates stay within what this module and `read_gltf` take; the usual rate may with more."""
+    """Return whether sampling at these rates stays within the limits of this module and of `read_gltf`."""
     frames = [track.duration * rate + 20 for track, rate in zip(tracks, rates, strict=True)]
     samples = sum(count * len(track.targets) for count, track in zip(frames, tracks, strict=True))
     most = max(frames, default=0)
@@ -175,7 +180,7 @@ def _affordable(tracks: list[_Track], rates: list[float], num_nodes: int) -> boo
 def _target(
     file: GltfFile, channel: dict[str, Any], samplers: list[dict[str, Any]], what: str
 ) -> tuple[int, str, dict[str, Any]] | None:
-    """Return node, path and sampler of a channel that moves a node."""
+    """Return node, path and sampler of a channel; None if it does not move a node."""
     target = channel.get("target")
     if not isinstance(target, dict):
         file.fail(f"a channel of {what} has no target; export it again")
@@ -185,12 +190,12 @@ def _target(
         return None
     sampler = channel.get("sampler")
     if type(sampler) is not int or not 0 <= sampler < len(samplers):
-        file.fail(f"a channel of {what} names no sampler; export it again")
+        file.fail(f"a channel of {what} has no sampler; export it again")
     return node, path, samplers[sampler]
 
 
 def _read_times(file: GltfFile, sampler: dict[str, Any], what: str) -> NDArray[np.float64]:
-    """Return the times [K] of a sampler's keys, seconds, K > 0."""
+    """Return the times [K] of the keys of a sampler, seconds, K > 0."""
     number = file.index(sampler, "input", "accessors", what)
     if number is None:
         file.fail(f"{what} has a sampler without input; export it again")
@@ -203,25 +208,33 @@ def _read_times(file: GltfFile, sampler: dict[str, Any], what: str) -> NDArray[n
 def _read_values(
     file: GltfFile, sampler: dict[str, Any], path: str, num_keys: int, what: str
 ) -> tuple[NDArray[np.float64], str]:
-    """Return the values [K, width] of a sampler (with tangents, [K, 3, width]) and its interpolation."""
+    """Return the values [K, width] of a sampler ([K, 3, width] with tangents) and its interpolation."""
     mode = sampler.get("interpolation", "LINEAR")
     if not isinstance(mode, str) or mode not in ("LINEAR", "STEP", "CUBICSPLINE"):
-        file.fail(f"{what} has an interpolation that is none of LINEAR, STEP and CUBICSPLINE; export it again")
+        file.fail(f"{what}: wanted the interpolation LINEAR, STEP or CUBICSPLINE, got another; export it again")
     number = file.index(sampler, "output", "accessors", what)
     if number is None:
         file.fail(f"{what} has a sampler without output; export it again")
     values = file.accessor(number, ("VEC4" if path == "rotation" else "VEC3",), f"values of {what}").astype(np.float64)
     each = 3 if mode == "CUBICSPLINE" else 1
     if len(values) != each * num_keys:
-        file.fail(f"{what} has {num_keys} times and {len(values)} values; export it again")
+        file.fail(f"{what}: wanted {each * num_keys} values for {num_keys} times, got {len(values)}; export it again")
     return (values.reshape(num_keys, 3, -1) if each == 3 else values), mode
 
 
 def _sample(
     times: NDArray[np.float64], values: NDArray[np.float64], mode: str, at: NDArray[np.float64], is_rotation: bool
 ) -> NDArray[np.float64]:
-    """Return [T, width] values at the times `at`; before the first key and after the last they are held."""
-    # A frame that misses its key by rounding belongs to it: with STEP it would show the key before.
+    """Return the values [T, width] at the times `at`; constant before the first key and after the last.
+
+    Args:
+        times: [K], times of the keys, seconds.
+        values: [K, width], or [K, 3, width] with tangents.
+        mode: interpolation.
+        at: [T], times of the frames, seconds.
+        is_rotation: whether the values are quaternions.
+    """
+    # A frame that misses its key by rounding belongs to that key; otherwise STEP would show the key before.
     left = np.clip(np.searchsorted(times, at + _EPSILON, "right") - 1, 0, len(times) - 1)
     right = np.minimum(left + 1, len(times) - 1)
     step = times[right] - times[left]
@@ -242,12 +255,12 @@ def _sample(
 
 
 def _slerp(a: NDArray[np.float64], b: NDArray[np.float64], u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the quaternions between a and b [T, 4] at u [T, 1], the short way round."""
+    """Return the spherical interpolation of the quaternions a and b [T, 4] at u [T, 1], along the shorter arc."""
     a, b = (q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30) for q in (a, b))
     cosine = (a * b).sum(1, keepdims=True)
     b, cosine = np.where(cosine < 0, -b, b), np.abs(cosine)
     angle = np.arccos(np.minimum(cosine, 1.0))
-    is_near = cosine > 1 - 1e-9  # the sine would be zero; a straight line is exact enough there
+    is_near = cosine > 1 - 1e-9  # the sine would be zero; linear interpolation is exact enough there
     sine = np.where(is_near, 1.0, np.sin(angle))
     weight_a = np.where(is_near, 1 - u, np.sin((1 - u) * angle) / sine)
     weight_b = np.where(is_near, u, np.sin(u * angle) / sine)

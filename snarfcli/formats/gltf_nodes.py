@@ -1,4 +1,4 @@
-"""The node tree of a glTF file: who is whose parent, and where each node is, at rest and over time.
+"""Read the node tree of a glTF file: parents, and the transform of each node at rest and over time.
 
 Source: Khronos, glTF 2.0 specification, sections 3.5.2 and 3.5.3 (node hierarchy, transformations).
 """
@@ -6,20 +6,37 @@ Source: Khronos, glTF 2.0 specification, sections 3.5.2 and 3.5.3 (node hierarch
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from snarfcli.formats.gltf_file import GltfFile
 
-__all__ = ["NodeTree", "compose"]
+__all__ = ["NodeTree", "ShownMesh", "compose"]
 
 _MAX_NODES = 10_000
 
 
+class ShownMesh(NamedTuple):
+    """A mesh in the default scene, as indices into the lists of the file."""
+
+    node: int
+    """The node that holds the mesh."""
+    mesh: int
+    skin: int | None
+    """The skin that moves the mesh; None if the node does."""
+
+
 def compose(translation: NDArray[np.float64], rotation: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return T @ R @ S [..., 4, 4] of translation [..., 3], unit quaternions [..., 4] (x, y, z, w) and scale [..., 3]."""
+    """Return the matrices T @ R @ S [..., 4, 4].
+
+    Args:
+        translation: [..., 3].
+        rotation: [..., 4], unit quaternions (x, y, z, w).
+        scale: [..., 3].
+    """
     shape = np.broadcast_shapes(translation.shape[:-1], rotation.shape[:-1], scale.shape[:-1])
     x, y, z, w = np.moveaxis(rotation, -1, 0)
     matrix = np.zeros((*shape, 4, 4))
@@ -33,18 +50,18 @@ def compose(translation: NDArray[np.float64], rotation: NDArray[np.float64], sca
 
 
 class NodeTree:
-    """The nodes of a file: a forest in which every node has at most one parent."""
+    """The nodes of a file: a forest, since every node has at most one parent."""
 
     def __init__(self, file: GltfFile) -> None:
-        """Read the hierarchy and the transformations at rest.
+        """Read the hierarchy and the transforms at rest.
 
         Raises:
-            UserError: a node is its own ancestor or has two parents, a number is out of range, a quaternion is zero.
+            UserError: a node is its own ancestor or has two parents, an index is out of range, or a quaternion is zero.
         """
         self._file = file
         self.nodes: list[dict[str, Any]] = file.items("nodes")
         if len(self.nodes) > _MAX_NODES:
-            file.fail(f"has {len(self.nodes)} nodes, more than {_MAX_NODES}; simplify the scene")
+            file.fail(f"wanted at most {_MAX_NODES} nodes, got {len(self.nodes)}; simplify the scene")
         self.parents = [-1] * len(self.nodes)
         self._children = [self._read_children(number) for number in range(len(self.nodes))]
         for number, children in enumerate(self._children):
@@ -53,12 +70,12 @@ class NodeTree:
                     file.fail(f"node {child} has two parents; export it again")
                 self.parents[child] = number
         self.order = self._below([number for number, parent in enumerate(self.parents) if parent < 0])
-        """All nodes, a parent before its children."""
+        """Indices of all nodes, a parent before its children."""
         if len(self.order) < len(self.nodes):
             file.fail("a node is its own ancestor; export it again")
         self._parts = [self._read_parts(number) for number in range(len(self.nodes))]
         self.locals = [self._read_local(number) for number in range(len(self.nodes))]
-        """[4, 4] each: from the node's frame to its parent's, at rest."""
+        """[4, 4] per node, transform from the frame of the node to that of its parent, at rest."""
 
     def _read_children(self, number: int) -> list[int]:
         children = self.nodes[number].get("children", [])
@@ -67,7 +84,7 @@ class NodeTree:
         return [self._file.checked_index(child, "nodes", f"a child of node {number}") for child in children]
 
     def _read_parts(self, number: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return translation, unit quaternion and scale of a node at rest."""
+        """Return translation [3], unit quaternion [4] and scale [3] of a node at rest."""
         node, what = self.nodes[number], f"node {number}"
         if "matrix" in node:  # the specification forbids shear here, and such nodes are not meant to be animated
             matrix = self._file.numbers(node, "matrix", (0.0,) * 16, what).reshape(4, 4).T
@@ -91,7 +108,7 @@ class NodeTree:
         return matrix
 
     def _below(self, roots: Iterable[int]) -> list[int]:
-        """Return the nodes `roots` and all below them, a parent before its children."""
+        """Return the nodes `roots` and all their descendants, a parent before its children."""
         found, waiting = [], list(reversed(list(roots)))
         while waiting:
             number = waiting.pop()
@@ -100,7 +117,7 @@ class NodeTree:
         return found
 
     def in_scene(self) -> list[int]:
-        """Return the nodes of the default scene, all nodes where the file has no scene."""
+        """Return the nodes of the default scene, or all nodes if the file has no scene."""
         file = self._file
         number = file.index(file.root, "scene", "scenes", "the file")
         scenes = file.items("scenes")
@@ -112,8 +129,22 @@ class NodeTree:
         roots = [file.checked_index(root, "nodes", f"a node of scene {number or 0}") for root in roots]
         return self._below(dict.fromkeys(root for root in roots if self.parents[root] < 0))
 
+    def shown_meshes(self) -> list[ShownMesh]:
+        """Return the meshes of the default scene, in the order of `in_scene`.
+
+        Raises:
+            UserError: an index is out of range.
+        """
+        file, shown = self._file, []
+        for number in self.in_scene():
+            node, what = self.nodes[number], f"node {number}"
+            mesh = file.index(node, "mesh", "meshes", what)
+            if mesh is not None:
+                shown.append(ShownMesh(number, mesh, file.index(node, "skin", "skins", what)))
+        return shown
+
     def with_ancestors(self, numbers: Iterable[int]) -> list[int]:
-        """Return these nodes and all above them, a parent before its children."""
+        """Return these nodes and all their ancestors, a parent before its children."""
         wanted: set[int] = set()
         for number in numbers:
             while number >= 0 and number not in wanted:
@@ -124,11 +155,11 @@ class NodeTree:
     def worlds(
         self, numbers: Iterable[int], animated: Mapping[int, Mapping[str, NDArray[np.float64]]] | None = None
     ) -> dict[int, NDArray[np.float64]]:
-        """Return where nodes are: [T, 4, 4] each, from the node's frame to the world; T is 1 for those that stand still.
+        """Return the transforms [T, 4, 4] from the frame of each node to the world; T is 1 for nodes that do not move.
 
         Args:
-            numbers: nodes, closed under `with_ancestors`, a parent before its children.
-            animated: for some nodes, some of `translation` [T, 3], `rotation` [T, 4] and `scale` [T, 3] over time.
+            numbers: node indices, as `with_ancestors` returns them.
+            animated: per moving node, some of `translation` [T, 3], `rotation` [T, 4] and `scale` [T, 3] over time.
         """
         found: dict[int, NDArray[np.float64]] = {}
         for number in numbers:
@@ -142,9 +173,7 @@ class NodeTree:
 
 
 def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the unit quaternion (x, y, z, w) nearest to a matrix that should be a rotation."""
-    from scipy.spatial.transform import Rotation
-
+    """Return the unit quaternion (x, y, z, w) of the rotation nearest to a matrix [3, 3]."""
     u, _, v = np.linalg.svd(rotation)
     u[:, 2] *= np.sign(np.linalg.det(u @ v)) or 1.0
     return Rotation.from_matrix(u @ v).as_quat()

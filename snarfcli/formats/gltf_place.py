@@ -1,37 +1,34 @@
-"""Where the skins of a glTF file belong in the world: the matrix that `read_gltf` calls `world_from_bind`."""
+"""Place the skins of a glTF file in the world: find the matrix that `read_gltf` calls `world_from_bind`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from snarfcli.formats.gltf_skin import Skin
+
 __all__ = ["placed_skins"]
 
-# Of the skeleton's size. Files hold float32; measured disagreement of one that agrees is about 1e-6.
+# Shares of the skeleton's size. Files hold float32; transforms that agree were measured to differ by about 1e-6.
 _TOLERANCE = 1e-3
 _ROUNDING = 1e-5
 
 
-class _Skin(Protocol):
-    joints: list[int]
-    inverse_bind: NDArray[np.float64]
-
-
 def placed_skins(
-    skins: Mapping[int, _Skin], here: Mapping[int, NDArray[np.float64]]
+    skins: Mapping[int, Skin], here: Mapping[int, NDArray[np.float64]]
 ) -> tuple[dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]]:
-    """Bring skins that share joints into one frame, the world where that is known.
+    """Bring skins that share joints into one frame, which is the world if that is known.
 
     Args:
-        skins: each with its joints (nodes) and their inverse bind matrices; the most important first.
-        here: [4, 4] where each node stands by default.
+        skins: skins by index, the most important first.
+        here: [4, 4] per node, transform from the node to the world by default.
 
     Returns:
-        `world_from_bind` [4, 4] of each skin that fits to those before it, and [4, 4] where each joint is at rest.
+        world_from_bind: [4, 4] per skin that agrees with the skins before it.
+        rest: [4, 4] per joint, transform from the joint at rest to the world.
     """
     world_from_bind: dict[int, NDArray[np.float64]] = {}
     rest: dict[int, NDArray[np.float64]] = {}
@@ -48,22 +45,22 @@ def placed_skins(
             wanted = np.stack([here[joint] for joint in skin.joints]) @ skin.inverse_bind
             world = wanted[0] if _agree(wanted, points) else _upright(wanted)
         if _agree(np.stack([world, np.eye(4)]), points, _ROUNDING):
-            world = np.eye(4)  # leaves the vertices as stored, to the last bit
+            world = np.eye(4)  # leaves the stored vertices bitwise unchanged
         world_from_bind[number] = world
         for joint, matrix in zip(skin.joints, world @ bind, strict=True):
             rest.setdefault(joint, matrix)
     return world_from_bind, rest
 
 
-def _probe_points(bind: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points [P, 3] that two affine maps must move alike to be the same for this skeleton."""
+def _probe_points(bind: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return test points [P, 3]: two affine maps that move them equally count as equal for this skeleton."""
     origins = bind[:: 1 + len(bind) // 64, :3, 3]
     size = np.ptp(origins, axis=0).max()
     return np.concatenate([origins, origins[0] + (size or 1.0) * np.eye(3)])
 
 
-def _agree(matrices: NDArray[np.float64], points: NDArray[np.float64], tolerance: float = _TOLERANCE) -> bool:
-    """Return whether the affine matrices [K, 4, 4] move the points alike."""
+def _agree(matrices: NDArray[np.floating], points: NDArray[np.floating], tolerance: float = _TOLERANCE) -> bool:
+    """Return whether the affine matrices [K, 4, 4] move the points [P, 3] equally, up to a share of the skeleton's size."""
     lowest = highest = points @ matrices[0, :3, :3].T + matrices[0, :3, 3]
     size = np.ptp(lowest, axis=0).max()
     for matrix in matrices[1:]:
@@ -73,10 +70,12 @@ def _agree(matrices: NDArray[np.float64], points: NDArray[np.float64], tolerance
 
 
 def _upright(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the nodes' scale, and the quarter turns nearest to theirs: what a pose does not change, or hardly.
+    """Return the matrix [4, 4] with the joints' scale and the nearest rotation by quarter turns.
+
+    These hardly depend on the pose of the nodes.
 
     Args:
-        matrices: [J, 4, 4] world from bind frame, as each joint has it.
+        matrices: [J, 4, 4], world from bind frame, as each joint has it.
     """
     linear = matrices[:, :3, :3]
     scale = float(np.median(np.cbrt(np.abs(np.linalg.det(linear)))))

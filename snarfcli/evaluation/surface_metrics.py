@@ -1,7 +1,7 @@
-"""How far an extracted surface is from the true one: Chamfer distance, normal consistency, F-score.
+"""Distance between two surfaces: Chamfer distance, normal consistency, F-score.
 
-Points are spread evenly over either surface, and each is compared with the nearest place of the other surface itself, not
-with the nearest of some samples of it: two equal surfaces have distance zero, however few points there are.
+Points are spread evenly over both surfaces. Each is compared with the nearest point of the other surface, not with the nearest
+of its samples, so two equal surfaces have distance zero for any number of points.
 """
 
 from __future__ import annotations
@@ -9,24 +9,26 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import igl
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from snarfcli.evaluation.evaluate import Samples, choose_frames
+from snarfcli.evaluation.evaluate import choose_frames
+from snarfcli.meshing.surfaces import field_surface
+from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
-
-if TYPE_CHECKING:
-    from snarfcli.models.trained_field import TrainedField
+from snarfcli.samples.store import SequenceSamples
+from snarfcli.sampling.triangles import area_normals, random_points_in
 
 __all__ = ["F_SCORE_DISTANCE_M", "SurfaceMetrics", "compare_surfaces", "measure_surfaces", "sample_surface", "surfaces_text"]
 
 log = logging.getLogger(__name__)
 
 F_SCORE_DISTANCE_M = 0.005
-"""Within this distance a point counts as right in the F-score, metres."""
+"""Distance within which a point counts as correct in the F-score, metres."""
 
 
 @dataclass(frozen=True)
@@ -36,25 +38,23 @@ class SurfaceMetrics:
     chamfer_m: float
     """Mean of the two mean distances, from the prediction to the truth and back, metres (not squared)."""
     normal_consistency: float
-    """Mean of the two mean cosines between a point's normal and that of the nearest place; 1 is equal, -1 inside out."""
+    """Mean of the two mean cosines between the normals at a point and at the nearest point; 1: equal, -1: inside out."""
     f_score: float
-    """Harmonic mean of the shares of points, of either surface, within 5 mm of the other."""
+    """Harmonic mean of two shares: the points of each surface within 5 mm of the other."""
 
 
-def measure_surfaces(avatar: TrainedField, sequences: Sequence[Samples], count: int, resolution: int) -> dict[str, Any]:
-    """Extract the avatar's surface in some frames, compare it with the true one, and return what `metrics.json` says of it.
+def measure_surfaces(avatar: TrainedField, sequences: Sequence[SequenceSamples], count: int, resolution: int) -> dict[str, Any]:
+    """Compare the avatar's surface with the true one in some frames, and return the results for `metrics.json`.
 
     Args:
         avatar: the avatar.
         sequences: samples.
-        count: so many frames, evenly spaced over all sequences.
+        count: number of frames, evenly spaced over all sequences.
         resolution: voxels along the longest side of the extracted meshes.
 
     Returns:
-        Means over the frames that have a surface, null if none has; how many frames, and how many of them have no surface.
+        Means over the frames that have a surface, None if there is none; the number of frames, and of frames without a surface.
     """
-    from snarfcli.meshing.surfaces import field_surface
-
     measured = []
     frames = choose_frames(sequences, count)
     for sequence, index in progress(frames, desc="comparing surfaces", unit="frames"):
@@ -74,7 +74,7 @@ def measure_surfaces(avatar: TrainedField, sequences: Sequence[Samples], count: 
 
 
 def surfaces_text(surfaces: Mapping[str, Any]) -> str:
-    """Return one line about what `measure_surfaces` found."""
+    """Return the results of `measure_surfaces` as one line."""
     frames = surfaces["frames"] - surfaces["frames_without_surface"]
     if not frames:
         return f"surfaces: none in {surfaces['frames']} frames"
@@ -88,28 +88,25 @@ def surfaces_text(surfaces: Mapping[str, Any]) -> str:
 def sample_surface(
     vertices: NDArray, faces: NDArray, count: int, generator: np.random.Generator
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return points [N, 3] spread evenly over a surface, and the faces [N] on which they lie.
+    """Return points [N, 3] spread evenly over a surface, and the index of the face of each [N].
 
     Args:
         vertices: [V, 3] metres.
         faces: [F, 3] vertex numbers.
         count: N.
-        generator: of the random numbers.
+        generator: source of random numbers.
 
     Raises:
         ValueError: the surface has no area.
     """
     corners = np.asarray(vertices, np.float64)[faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = np.linalg.norm(area_normals(corners), axis=1)  # twice the areas
     if not areas.sum() > 0:
         raise ValueError("the surface has no area, so nothing can be compared with it")
     # Evenly spaced in the running area: as random as independent draws, with less noise.
     places = (np.arange(count) + generator.random(count)) / count
     chosen = np.minimum(np.searchsorted(np.cumsum(areas) / areas.sum(), places), len(faces) - 1)
-    first, second = generator.random((2, count, 1))
-    root = np.sqrt(first)  # uniform in a triangle: Osada et al., Shape Distributions, 2002, Eq. 1
-    a, b, c = corners[chosen].transpose(1, 0, 2)
-    return (1 - root) * a + root * (1 - second) * b + root * second * c, chosen
+    return random_points_in(corners[chosen], generator), chosen
 
 
 def compare_surfaces(
@@ -123,9 +120,9 @@ def compare_surfaces(
 
     Args:
         truth: vertices [V, 3], metres, and outward faces [F, 3].
-        predicted: the same of the prediction.
-        count: points on either surface.
-        seed: of their places.
+        predicted: vertices and faces of the prediction, as for `truth`.
+        count: number of points on each surface.
+        seed: of the points.
 
     Raises:
         ValueError: a surface has no area.
@@ -145,8 +142,6 @@ def _distances(
     start: tuple[NDArray, NDArray], end: tuple[NDArray, NDArray], count: int, generator: np.random.Generator
 ) -> tuple[float, float, float]:
     """Return mean distance, mean cosine of the normals and share within 5 mm, from one surface to the other."""
-    import igl
-
     points, faces = sample_surface(*start, count, generator)
     vertices, triangles = np.asarray(end[0], np.float64), np.asarray(end[1], np.int64)
     squared, nearest, _ = igl.point_mesh_squared_distance(points, vertices, triangles)[:3]
@@ -157,6 +152,5 @@ def _distances(
 
 def _normals(vertices: NDArray, faces: NDArray) -> NDArray[np.float64]:
     """Return the unit normals [F, 3] of faces; zero for one without area."""
-    a, b, c = np.asarray(vertices, np.float64)[faces].transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
+    normal = area_normals(np.asarray(vertices, np.float64)[faces])
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)

@@ -25,7 +25,7 @@ import numpy as np
 
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import file_digest, read_json
-from snarfcli.sampling.points import dequantise, unpack_vertices
+from snarfcli.sampling.cube import dequantise, unpack_vertices
 
 if TYPE_CHECKING:
     from snarfcli.bodies.skeleton import Skeleton

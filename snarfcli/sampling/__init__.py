@@ -1,5 +1,6 @@
-"""Points and occupancies of one posed mesh."""
+"""Labelled points of posed meshes."""
 
+from snarfcli.sampling.cube import CUBE_PADDING, dequantise, pack_vertices, quantise, sampling_cube, unpack_vertices
 from snarfcli.sampling.occupancy import (
     INSIDE_TESTS,
     check_mesh,
@@ -11,28 +12,23 @@ from snarfcli.sampling.occupancy import (
 )
 from snarfcli.sampling.planar import in_turned_over, outline_samples
 from snarfcli.sampling.points import (
-    CUBE_PADDING,
     BrokenFrame,
     FrameSamples,
+    MeshSequence,
     SamplingSettings,
     check_frames,
-    dequantise,
     frame_generator,
-    pack_vertices,
-    quantise,
     sample_frame,
     sample_frames,
-    sampling_cube,
-    surface_samples,
-    uniform_surface_samples,
-    unpack_vertices,
 )
+from snarfcli.sampling.surface import surface_samples, uniform_surface_samples
 
 __all__ = [
     "CUBE_PADDING",
     "INSIDE_TESTS",
     "BrokenFrame",
     "FrameSamples",
+    "MeshSequence",
     "SamplingSettings",
     "check_frames",
     "check_mesh",

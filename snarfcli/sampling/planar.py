@@ -1,24 +1,25 @@
-"""Two-dimensional shapes: upright prisms around the plane z = 0, of which that plane alone is sampled."""
+"""Two-dimensional shapes: upright prisms around the plane z = 0, sampled on that plane only."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from snarfcli.errors import UserError
+from snarfcli.sampling.triangles import area_normals, random_points_in
 
 __all__ = ["in_turned_over", "outline_samples", "with_plane_on_cells"]
 
 _UPRIGHT = 1e-3  # largest share of a wall's normal along z; float32 leaves 1e-6
-_PAIRS_AT_ONCE = 1 << 20  # of a point and a triangle, which bounds the memory
+_PAIRS_AT_ONCE = 1 << 20  # pairs of a point and a triangle; bounds the memory
 
 
 def with_plane_on_cells(cube_lower: np.ndarray, cube_size: np.float32, levels: int) -> np.ndarray:
-    """Return the corner [3] of a cube, float32, metres, moved along z so that z = 0 is the centre of a cell, exactly.
+    """Return the lower corner [3] of a cube, float32, metres, moved along z so that z = 0 is exactly the centre of a cell.
 
     Args:
-        cube_lower: [3] float32, metres, of a cube that the plane halves.
+        cube_lower: [3] float32, metres; the plane halves the cube.
         cube_size: metres.
-        levels: steps along a side.
+        levels: number of cells along a side.
     """
     moved = cube_lower.copy()
     moved[2] = -(np.float32(levels // 2) + np.float32(0.5)) * (np.float32(cube_size) / np.float32(levels))
@@ -26,22 +27,22 @@ def with_plane_on_cells(cube_lower: np.ndarray, cube_size: np.float32, levels: i
 
 
 def outline_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Return points of the outline of a prism, spread evenly along it: one in each of `count` equal shares of its walls.
+    """Return points spread evenly along the outline of a prism: one in each of `count` equal shares of its walls.
 
     Args:
-        vertices: [V, 3] metres.
-        faces: [F, 3] vertex numbers.
+        vertices: [V, 3], metres.
+        faces: [F, 3], vertex indices.
         count: number of points.
-        generator: draws them.
+        generator: source of random numbers.
 
     Returns:
         [count, 3] float64, metres, z = 0, wall after wall.
 
     Raises:
-        UserError: nothing of the mesh stands upright on the plane.
+        UserError: the mesh has no upright wall.
     """
     corners = vertices.astype(np.float64)[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = area_normals(corners)
     lengths = np.linalg.norm(normals, axis=1)
     areas = np.where(np.abs(normals[:, 2]) < _UPRIGHT * lengths, lengths, 0.0)
     if not areas.sum() > 0:
@@ -49,10 +50,7 @@ def outline_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generat
     ends = np.cumsum(areas)
     places = (np.arange(count) + generator.random(count)) * (ends[-1] / max(1, count))
     chosen = np.minimum(np.searchsorted(ends, places, side="right"), np.flatnonzero(areas)[-1])
-    first, second = generator.random((2, count, 1))
-    root = np.sqrt(first)  # uniform in a triangle: Osada et al., Shape Distributions, 2002, Eq. 1
-    a, b, c = corners[chosen].transpose(1, 0, 2)
-    points = (1 - root) * a + root * (1 - second) * b + root * second * c
+    points = random_points_in(corners[chosen], generator)
     points[:, 2] = 0.0
     return points
 
@@ -61,13 +59,13 @@ def in_turned_over(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) 
     """Return which points lie in a part of a moved prism that the motion has turned over, [N] bool.
 
     At a sharp bend linear blend skinning folds the inner side over. The winding number counts such a part as -1, so at the edge
-    of the fold it calls points outside onto which inside points are moved. With this they are inside, as in the union
-    over all correspondences (SNARF Eq. 9).
+    of the fold it calls points outside although inside points move there. Adding this test makes them inside, as in the
+    union over all correspondences (SNARF Eq. 9).
 
     Args:
-        vertices: [V, 3] metres.
-        faces: [F, 3] vertex numbers; the triangles above the plane z = 0 are the top, outward where nothing is turned over.
-        points: [N, 3] metres, on the plane.
+        vertices: [V, 3], metres.
+        faces: [F, 3], vertex indices; the triangles above the plane z = 0 are the top, outward where nothing is turned over.
+        points: [N, 3], on the plane, metres.
     """
     corners = vertices.astype(np.float64)[faces]
     top = corners[(corners[..., 2] > 0).all(1)][..., :2]

@@ -1,4 +1,4 @@
-"""Occupancy samples of one posed mesh: half of them uniform in the papers' box, half near the surface."""
+"""Occupancy samples of posed meshes: half of them uniform in the papers' cube, half near the surface."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from snarfcli.errors import UserError, nearest
+from snarfcli.sampling.cube import CUBE_LEVELS, dequantise, pack_vertices, quantise, sampling_cube
 from snarfcli.sampling.occupancy import (
     INSIDE_TESTS,
     check_mesh,
@@ -19,54 +20,36 @@ from snarfcli.sampling.occupancy import (
     winding_numbers,
 )
 from snarfcli.sampling.planar import in_turned_over, outline_samples, with_plane_on_cells
+from snarfcli.sampling.surface import surface_samples
 
 __all__ = [
-    "CUBE_PADDING",
     "BrokenFrame",
     "FrameSamples",
+    "MeshSequence",
     "SamplingSettings",
     "check_frames",
-    "dequantise",
     "frame_generator",
-    "pack_vertices",
-    "quantise",
     "sample_frame",
     "sample_frames",
-    "sampling_cube",
-    "surface_samples",
-    "uniform_surface_samples",
-    "unpack_vertices",
 ]
-
-CUBE_PADDING = 0.1
-"""The papers' box is a cube around the mesh whose side is the longest side of the tight box times 1.1."""
-
-_LEVELS = 65536  # uint16; in a cube of 2 m the steps are 30 micrometres
-_VERTEX_BITS = 21  # three of them fit a uint64
-_VERTEX_LEVELS = 1 << _VERTEX_BITS
-# MeshLab draws this many candidates for each sample and keeps those that are a disk apart. Its defaults (20, and the best
-# of 10 in each cell) take 5 times as long; the spacing varies by 7 % then and by 10 % so, below noise as wide as the spacing.
-_POISSON_OPTIONS = {"montecarlorate": 6, "bestsampleflag": False}
-_POISSON_REQUEST = 0.93  # with these options it gives 1.11 times the samples asked for: some 3 % to spare
-_THINNEST = 1e-7  # distance of samples to length of the mesh; MeshLab never comes back from below 1e-10 (32-bit cells)
 
 
 @dataclass(frozen=True)
 class SamplingSettings:
-    """How the points of every frame are chosen and labelled."""
+    """How the points of a frame are chosen and labelled."""
 
     points_per_frame: int
-    """Number of points P of a frame, a multiple of 8; the first half is uniform in the cube, the rest near the surface."""
+    """Number of points P per frame, a multiple of 8; the first half is uniform in the cube, the rest near the surface."""
     surface_noise_m: float
     """Standard deviation of the isotropic Gaussian noise on the surface points, metres (SNARF section 4.1)."""
     padding: float
-    """How much longer the sampling cube is than the longest side of the tight box, as a share."""
+    """Added to the longest side of the tight box for the side of the sampling cube, as a share of it."""
     inside_test: str
-    """`winding` or `parity`."""
+    """`winding` or `parity`, see `INSIDE_TESTS`."""
     seed: int
-    """Start of all random numbers."""
+    """Seed of all random numbers."""
     is_planar: bool = False
-    """Whether the subject is two-dimensional: a prism, sampled on the plane z = 0 alone and near its outline there."""
+    """Whether the subject is two-dimensional: a prism, sampled only on the plane z = 0 and near its outline there."""
 
     def __post_init__(self) -> None:
         if self.points_per_frame < 8 or self.points_per_frame % 8:
@@ -84,20 +67,20 @@ class SamplingSettings:
 
 @dataclass(frozen=True)
 class FrameSamples:
-    """Labelled points of one posed mesh, and the mesh itself."""
+    """Labelled points of one posed mesh, and the mesh."""
 
     points: np.ndarray
     """[P, 3] uint16, quantised in the cube; first half uniform, second half near the surface."""
     occupied: np.ndarray
     """[P] bool, labels of the quantised points."""
     vertices: np.ndarray
-    """[V] uint64, the mesh's vertices in the cube, see `pack_vertices`."""
+    """[V] uint64, vertices of the mesh in the cube, see `pack_vertices`."""
     faces: np.ndarray
     """[F, 3] int32."""
     cube_lower: np.ndarray
-    """[3] float32, the cube's corner, metres."""
+    """[3] float32, lower corner of the cube, metres."""
     cube_size: np.float32
-    """The cube's side, metres."""
+    """Side of the cube, metres."""
     box_lower: np.ndarray
     """[3] float32, lower corner of the mesh's tight box, metres."""
     box_upper: np.ndarray
@@ -105,19 +88,19 @@ class FrameSamples:
     boundary_edges: int
     """Number of edges at which the mesh is open."""
     differing: int
-    """Number of points that the other inside test would label differently (closed meshes; 0 for open ones)."""
+    """Number of points that the other inside test would label differently; 0 for an open mesh."""
 
 
 @dataclass(frozen=True)
 class BrokenFrame:
-    """What comes instead of the samples of a frame that cannot be used; the frames after it are not looked at."""
+    """Stands for a frame that cannot be used; later frames are not read."""
 
     message: str
-    """One line: which mesh, what is wrong, what to do."""
+    """One line: which mesh, what is wrong, the next step."""
 
 
 class MeshSequence(Protocol):
-    """Posed meshes: vertices [V, 3], metres, and outward faces [F, 3]."""
+    """Posed meshes by index: vertices [V, 3], metres, and outward faces [F, 3]; `source` is the file of one, or empty."""
 
     def __len__(self) -> int: ...
 
@@ -127,137 +110,9 @@ class MeshSequence(Protocol):
 
 
 def frame_generator(seed: int, *names: str | int) -> np.random.Generator:
-    """Return the random generator of one frame, a function of the seed and of the names of subject, sequence, frame."""
+    """Return the random generator of one frame, which depends on the seed and on the names of subject, sequence and frame."""
     digest = hashlib.sha256("/".join(str(part) for part in (seed, *names)).encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, np.uint32))
-
-
-def sampling_cube(vertices: np.ndarray, padding: float = CUBE_PADDING) -> tuple[np.ndarray, np.float32]:
-    """Return the papers' sampling cube of a posed mesh.
-
-    Args:
-        vertices: [V, 3] metres.
-        padding: how much longer the cube is than the longest side of the tight box, as a share.
-
-    Returns:
-        Its lower corner [3] and its side, float32, metres.
-    """
-    lower, upper = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
-    size = (upper - lower).max() * (1.0 + padding)
-    return ((lower + upper - size) / 2).astype(np.float32), np.float32(size)
-
-
-def quantise(points: np.ndarray, cube_lower: np.ndarray, cube_size: float) -> np.ndarray:
-    """Return the uint16 cells in which points lie; a point outside the cube goes to the nearest cell of its border.
-
-    Args:
-        points: [..., 3] metres.
-        cube_lower: [3] metres.
-        cube_size: metres.
-    """
-    cells = np.floor((points - cube_lower) * (_LEVELS / np.float64(cube_size)))
-    return np.clip(cells, 0, _LEVELS - 1).astype(np.uint16)
-
-
-def dequantise(cells: np.ndarray, cube_lower: np.ndarray, cube_size: np.ndarray | float) -> np.ndarray:
-    """Return the float32 centres of uint16 cells. Labels are made for exactly these points, so nothing is lost.
-
-    Args:
-        cells: [..., 3] uint16.
-        cube_lower: [..., 3] float32, metres, broadcast against `cells`.
-        cube_size: [..., 1] or a number, float32, metres.
-    """
-    step = np.asarray(cube_size, np.float32) / np.float32(_LEVELS)
-    return (cells.astype(np.float32) + np.float32(0.5)) * step + np.asarray(cube_lower, np.float32)
-
-
-def pack_vertices(vertices: np.ndarray, cube_lower: np.ndarray, cube_size: float) -> np.ndarray:
-    """Return vertices [V, 3], metres, as one uint64 each [V]: 21 bits an axis, in a cube of 2 m right to half a micrometre.
-
-    The mesh stays finer than the 16 bits of the points, for which no label would be wrong beyond 0.01 mm from the surface.
-    """
-    cells = np.floor((np.asarray(vertices, np.float64) - cube_lower) * (_VERTEX_LEVELS / np.float64(cube_size)))
-    x, y, z = np.clip(cells, 0, _VERTEX_LEVELS - 1).astype(np.uint64).T
-    return x | y << np.uint64(_VERTEX_BITS) | z << np.uint64(2 * _VERTEX_BITS)
-
-
-def unpack_vertices(packed: np.ndarray, cube_lower: np.ndarray, cube_size: float) -> np.ndarray:
-    """Return the vertices [V, 3] float32, metres, that `pack_vertices` packed."""
-    shifts = np.array([0, _VERTEX_BITS, 2 * _VERTEX_BITS], np.uint64)
-    cells = (packed[:, None] >> shifts) & np.uint64(_VERTEX_LEVELS - 1)
-    step = np.float64(cube_size) / _VERTEX_LEVELS
-    return ((cells.astype(np.float64) + 0.5) * step + cube_lower).astype(np.float32)
-
-
-def surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Return `count` points spread evenly over a surface: Poisson-disk samples by MeshLab.
-
-    MeshLab hits the count only roughly, so a few samples are dropped at random, or drawn uniformly in addition. It also
-    has a random state of its own that cannot be set: the same call gives the same points only as the first of its process.
-
-    Args:
-        vertices: [V, 3] metres.
-        faces: [F, 3] vertex numbers.
-        count: number of points.
-        generator: chooses what is dropped or added.
-
-    Returns:
-        [count, 3] float64, metres, in random order.
-
-    Raises:
-        UserError: the surface has no area, or next to none for its length.
-    """
-    import pymeshlab
-
-    corners, areas = _triangles(vertices, faces)
-    length = float(np.ptp(vertices, axis=0).max())
-    if np.sqrt(areas.sum() / max(1, count)) < _THINNEST * length:
-        size = f"{areas.sum():.3g} m^2, {length:.3g} m long"
-        raise UserError(f"mesh has next to no area ({size}), so nothing can be sampled on its surface; repair this frame")
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), faces.astype(np.int32)))
-    meshes.generate_sampling_poisson_disk(samplenum=max(1, round(count * _POISSON_REQUEST)), **_POISSON_OPTIONS)
-    points = generator.permutation(meshes.current_mesh().vertex_matrix())[:count]
-    missing = count - len(points)
-    if missing:
-        points = np.concatenate([points, _uniform_in_triangles(corners, areas, missing, generator)])
-    return points
-
-
-def uniform_surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Return `count` independent points, uniform on a surface: in a fiftieth of the time of `surface_samples`, less even.
-
-    Args:
-        vertices: [V, 3] metres.
-        faces: [F, 3] vertex numbers.
-        count: number of points.
-        generator: draws them.
-
-    Returns:
-        [count, 3] float64, metres.
-
-    Raises:
-        UserError: the surface has no area.
-    """
-    return _uniform_in_triangles(*_triangles(vertices, faces), count, generator)
-
-
-def _triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners [F, 3, 3] of a mesh's triangles and their areas [F]; refuse a mesh without area."""
-    corners = vertices.astype(np.float64)[faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    if not areas.sum() > 0:
-        raise UserError("mesh has no area, so nothing can be sampled on its surface; leave this frame out")
-    return corners, areas
-
-
-def _uniform_in_triangles(corners: np.ndarray, areas: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Return `count` points [count, 3], uniform on triangles."""
-    chosen = generator.choice(len(areas), count, p=areas / areas.sum())
-    first, second = generator.random((2, count, 1))
-    root = np.sqrt(first)  # uniform in a triangle: Osada et al., Shape Distributions, 2002, Eq. 1
-    a, b, c = corners[chosen].transpose(1, 0, 2)
-    return (1 - root) * a + root * (1 - second) * b + root * second * c
 
 
 def sample_frame(
@@ -271,19 +126,19 @@ def sample_frame(
     """Sample labelled points of one posed mesh (SNARF section 4.1; the cube is its released code's).
 
     Args:
-        vertices: [V, 3] metres, posed.
-        faces: [F, 3] vertex numbers, outward.
-        settings: how many points, and how they are chosen and labelled.
+        vertices: [V, 3], posed, metres.
+        faces: [F, 3], vertex indices, outward.
+        settings: of the points and their labels.
         generator: from `frame_generator`.
-        boundary_edges: of the mesh; 0 says that it is closed, so that both inside tests can be compared.
+        boundary_edges: number of boundary edges of the mesh; with 0, a closed mesh, both inside tests are compared.
     """
     count = settings.points_per_frame
     is_used = np.zeros(len(vertices), bool)
     is_used[faces] = True
-    surface = vertices[is_used]  # what no face uses may lie anywhere
+    surface = vertices[is_used]  # unused vertices may lie anywhere
     cube_lower, cube_size = sampling_cube(surface, settings.padding)
     if settings.is_planar:
-        cube_lower = with_plane_on_cells(cube_lower, cube_size, _LEVELS)
+        cube_lower = with_plane_on_cells(cube_lower, cube_size, CUBE_LEVELS)
     uniform = cube_lower + generator.random((count // 2, 3)) * cube_size
     spread = outline_samples if settings.is_planar else surface_samples
     near = spread(vertices, faces, count - count // 2, generator)
@@ -315,16 +170,16 @@ def sample_frame(
 def sample_frames(
     meshes: MeshSequence, settings: SamplingSettings, names: Sequence[str], frames: Sequence[int]
 ) -> Iterator[FrameSamples | BrokenFrame]:
-    """Sample one posed mesh after another; the random numbers of each depend on its own names and frame number.
+    """Sample posed meshes one by one; the random numbers of each depend on its names and frame number.
 
     Args:
         meshes: T meshes.
         settings: see `sample_frame`.
-        names: what tells this sequence from others, such as subject and sequence name.
-        frames: [T] frame numbers within the sequence.
+        names: identify the sequence, for example by subject and sequence name.
+        frames: [T] frame numbers in the sequence.
 
     Yields:
-        The samples of each frame, or what is wrong with the first one that cannot be used.
+        The samples of each frame; at the first frame that cannot be used a `BrokenFrame`, and then no more.
     """
     for index, (mesh, where) in enumerate(_checked_meshes(meshes, settings.inside_test, names[-1], frames)):
         if isinstance(mesh, BrokenFrame):
@@ -341,13 +196,13 @@ def sample_frames(
 
 
 def check_frames(meshes: MeshSequence, inside_test: str, sequence: str, frames: Sequence[int]) -> Iterator[BrokenFrame | None]:
-    """Read one posed mesh after another, and yield None for each that can be used, or what is wrong with the first that cannot.
+    """Read posed meshes one by one; yield None for each usable one, and a `BrokenFrame` at the first that is not.
 
     Args:
         meshes: T meshes.
         inside_test: one of `INSIDE_TESTS`.
-        sequence: its name, for messages.
-        frames: [T] frame numbers within the sequence.
+        sequence: name of the sequence, for messages.
+        frames: [T] frame numbers in the sequence.
     """
     for mesh, _ in _checked_meshes(meshes, inside_test, sequence, frames):
         yield mesh if isinstance(mesh, BrokenFrame) else None
@@ -356,7 +211,7 @@ def check_frames(meshes: MeshSequence, inside_test: str, sequence: str, frames: 
 def _checked_meshes(
     meshes: MeshSequence, inside_test: str, sequence: str, frames: Sequence[int]
 ) -> Iterator[tuple[tuple[np.ndarray, np.ndarray, int] | BrokenFrame, str]]:
-    """Yield vertices, faces and number of boundary edges of each mesh, and what to call it, until one is broken."""
+    """Yield vertices, faces and number of boundary edges of each mesh, and its name in messages, until one is broken."""
     checked: np.ndarray | None = None
     boundary_edges = 0
     for index, frame in enumerate(frames):

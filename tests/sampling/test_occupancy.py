@@ -97,7 +97,7 @@ def test_unusable_meshes_are_refused() -> None:
         ((vertices, faces[:0]), "m is empty .*0 faces"),
         ((vertices[:0], faces[:0]), "m is empty"),
         ((broken, faces), "m has 1 vertices that are NaN"),
-        ((vertices[:-1], faces), "a face names vertex"),
+        ((vertices[:-1], faces), "but a face has vertex index"),
         ((vertices, faces[:, ::-1]), "m is inside out"),
     ):
         with pytest.raises(UserError, match=message):

@@ -66,7 +66,7 @@ def test_surface_samples_lie_evenly_on_the_surface(count: int) -> None:
 
 
 def test_missing_samples_are_drawn_from_the_faces(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("snarfcli.sampling.points._POISSON_REQUEST", 0.2)
+    monkeypatch.setattr("snarfcli.sampling.surface._POISSON_REQUEST", 0.2)
     vertices, faces = capsule_mesh(0.5, 0.1)
     points = surface_samples(vertices, faces, 2000, np.random.default_rng(1))
     assert points.shape == (2000, 3)

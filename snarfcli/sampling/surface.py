@@ -1,0 +1,83 @@
+"""Points on the surface of a triangle mesh: spread evenly, or uniformly at random."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from snarfcli.errors import UserError
+from snarfcli.sampling.triangles import area_normals, random_points_in
+
+__all__ = ["surface_samples", "uniform_surface_samples"]
+
+# MeshLab draws this number of candidates per sample and keeps those that are a disk apart. Its defaults (20, and the best of
+# 10 per cell) take 5 times as long; the spacing then varies by 7 % instead of 10 %, which noise as wide as the spacing hides.
+_POISSON_OPTIONS = {"montecarlorate": 6, "bestsampleflag": False}
+_POISSON_REQUEST = 0.93  # with these options MeshLab returns 1.11 times the requested number, which leaves some 3 % to spare
+_THINNEST = 1e-7  # spacing of samples to length of the mesh; below 1e-10 MeshLab does not return (32-bit cells)
+
+
+def surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Return `count` points spread evenly over a surface: Poisson-disk samples by MeshLab.
+
+    MeshLab meets the number only roughly, so a few samples are dropped at random, or drawn uniformly in addition. Its random
+    state cannot be set: the same call gives the same points only as the first call in its process.
+
+    Args:
+        vertices: [V, 3], metres.
+        faces: [F, 3], vertex indices.
+        count: number of points.
+        generator: chooses the points that are dropped or added.
+
+    Returns:
+        [count, 3] float64, metres, in random order.
+
+    Raises:
+        UserError: the surface has no area, or next to none for its length.
+    """
+    import pymeshlab  # here: loading it takes 0.2 s, which processes that draw only uniform points save
+
+    corners, areas = _triangles(vertices, faces)
+    length = float(np.ptp(vertices, axis=0).max())
+    if np.sqrt(areas.sum() / max(1, count)) < _THINNEST * length:
+        size = f"{areas.sum():.3g} m^2, {length:.3g} m long"
+        raise UserError(f"mesh has next to no area ({size}), so nothing can be sampled on its surface; repair this frame")
+    meshes = pymeshlab.MeshSet()  # pyright: ignore[reportAttributeAccessIssue]  # defined in its extension module, without stubs
+    meshes.add_mesh(pymeshlab.Mesh(vertices.astype(np.float64), faces.astype(np.int32)))  # pyright: ignore[reportAttributeAccessIssue]
+    meshes.generate_sampling_poisson_disk(samplenum=max(1, round(count * _POISSON_REQUEST)), **_POISSON_OPTIONS)
+    points = generator.permutation(meshes.current_mesh().vertex_matrix())[:count]
+    missing = count - len(points)
+    if missing:
+        points = np.concatenate([points, _uniform_in_triangles(corners, areas, missing, generator)])
+    return points
+
+
+def uniform_surface_samples(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Return `count` independent, uniform points on a surface: 50 times as fast as `surface_samples`, less evenly spread.
+
+    Args:
+        vertices: [V, 3], metres.
+        faces: [F, 3], vertex indices.
+        count: number of points.
+        generator: source of random numbers.
+
+    Returns:
+        [count, 3] float64, metres.
+
+    Raises:
+        UserError: the surface has no area.
+    """
+    return _uniform_in_triangles(*_triangles(vertices, faces), count, generator)
+
+
+def _triangles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners [F, 3, 3] and areas [F] of a mesh's triangles; raise UserError if they have no area."""
+    corners = vertices.astype(np.float64)[faces]
+    areas = np.linalg.norm(area_normals(corners), axis=1) / 2
+    if not areas.sum() > 0:
+        raise UserError("mesh has no area, so nothing can be sampled on its surface; leave this frame out")
+    return corners, areas
+
+
+def _uniform_in_triangles(corners: np.ndarray, areas: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Return `count` points [count, 3], uniform on triangles."""
+    return random_points_in(corners[generator.choice(len(areas), count, p=areas / areas.sum())], generator)

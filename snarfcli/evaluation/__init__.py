@@ -1,4 +1,4 @@
-"""Accuracy of avatars: IoU and its means, tables, reports, and a picture of the worst and the best frames."""
+"""Accuracy of avatars: IoU and its means, tables, reports, and a figure of the worst and best frames."""
 
 from __future__ import annotations
 

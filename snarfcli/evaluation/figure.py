@@ -6,29 +6,33 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from PIL import Image, ImageDraw
 
-from snarfcli.evaluation.evaluate import Samples, predict_inside
+from snarfcli.evaluation.evaluate import predict_inside
 from snarfcli.evaluation.metrics import FrameMetrics
+from snarfcli.meshing.mesh import Mesh
+from snarfcli.meshing.surfaces import field_surface
+from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
-
-if TYPE_CHECKING:
-    from snarfcli.models.trained_field import TrainedField
+from snarfcli.rendering.camera import Camera
+from snarfcli.rendering.render import render
+from snarfcli.rendering.sheet import contact_sheet, write_png
+from snarfcli.samples.store import SequenceSamples
 
 __all__ = ["EXTRA", "MISSING", "choose_extremes", "draw_frame", "write_figure"]
 
 log = logging.getLogger(__name__)
 
 MISSING = (214, 39, 40)
-"""Colour, sRGB, of points that are inside and were predicted to be outside."""
+"""sRGB colour of points that are inside but were predicted to be outside."""
 EXTRA = (31, 87, 200)
-"""Colour, sRGB, of points that are outside and were predicted to be inside."""
+"""sRGB colour of points that are outside but were predicted to be inside."""
 
 _PANEL = 320  # pixels
-_APART = 8  # a sequence is cut into so many stretches, and of each at most one frame is among the worst or the best
+_STRETCHES = 8  # parts of a sequence; at most one frame per part is among the worst, and one among the best
 _PALE = 225  # sRGB grey of the body under the points
 _COLUMNS = ("ground truth", "prediction", "red: missing points, blue: extra points")
 
@@ -36,8 +40,8 @@ _COLUMNS = ("ground truth", "prediction", "red: missing points, blue: extra poin
 def choose_extremes(frames: Sequence[FrameMetrics], count: int) -> tuple[list[FrameMetrics], list[FrameMetrics]]:
     """Return the `count` worst frames, worst first, and the best ones, best first, by surface IoU.
 
-    Neighbouring frames look alike, so of each eighth of a sequence at most one is taken among either. No frame is in
-    both lists; of few frames the worse half is the worst.
+    Neighbouring frames look alike, so each list has at most one frame per eighth of a sequence. No frame is in both lists; with
+    few frames the worse half counts as the worst.
     """
     count = min(count, max(1, len(frames) // 2))
     length = {name: 1 + max(f.frame for f in frames if f.sequence == name) for name in {f.sequence for f in frames}}
@@ -46,7 +50,7 @@ def choose_extremes(frames: Sequence[FrameMetrics], count: int) -> tuple[list[Fr
     def pick(candidates: Sequence[FrameMetrics]) -> list[FrameMetrics]:
         chosen: dict[tuple[str, int], FrameMetrics] = {}
         for frame in candidates:
-            stretch = (frame.sequence, frame.frame * _APART // length[frame.sequence])
+            stretch = (frame.sequence, frame.frame * _STRETCHES // length[frame.sequence])
             chosen.setdefault(stretch, frame)
         return list(chosen.values())[:count]
 
@@ -58,26 +62,24 @@ def choose_extremes(frames: Sequence[FrameMetrics], count: int) -> tuple[list[Fr
 def write_figure(
     path: str | Path,
     avatar: TrainedField,
-    sequences: Sequence[Samples],
+    sequences: Sequence[SequenceSamples],
     frames: Sequence[FrameMetrics],
     *,
     count: int = 3,
     resolution: int = 128,
     title: str = "",
 ) -> None:
-    """Write a PNG, whole or not at all: the worst frames on the left, the best on the right, by surface IoU.
+    """Write a PNG with the worst frames on the left and the best on the right, by surface IoU. The file is whole or absent.
 
     Args:
-        path: where to.
-        avatar: the avatar that was measured.
-        sequences: samples; their names are those in `frames`.
-        frames: what was measured.
-        count: how many of either.
+        path: of the PNG.
+        avatar: the measured avatar.
+        sequences: samples that include all sequences named in `frames`.
+        frames: measured frames.
+        count: maximum number of worst frames, and of best frames.
         resolution: voxels along the longest side of the predicted meshes.
-        title: what the figure shows.
+        title: of the figure; empty for none.
     """
-    from snarfcli.rendering.sheet import contact_sheet, write_png
-
     by_name = {sequence.name: sequence for sequence in sequences}
     worst, best = choose_extremes(frames, count)
     rows: list[list[np.ndarray | None]] = [[] for _ in worst]
@@ -101,26 +103,21 @@ def write_figure(
 
 
 def draw_frame(
-    avatar: TrainedField, sequence: Samples, index: int, *, resolution: int, size: int = _PANEL
+    avatar: TrainedField, sequence: SequenceSamples, index: int, *, resolution: int, size: int = _PANEL
 ) -> tuple[list[np.ndarray | None], tuple[int, int]]:
-    """Draw one frame from one camera: ground truth, prediction, and the points whose label was predicted wrong.
+    """Draw one frame from one camera: ground truth, prediction and wrongly labelled points.
 
     Args:
         avatar: the predicting avatar.
         sequence: samples.
-        index: frame.
+        index: frame index.
         resolution: voxels along the longest side of the predicted mesh.
         size: pixels along each side of a picture.
 
     Returns:
-        Three pictures [size, size, 3] uint8, sRGB, None for the prediction where the field has no surface; and the
-        numbers of missing and of extra points.
+        Three pictures [size, size, 3] uint8, sRGB, where the prediction is None if the field has no surface; and the numbers of
+        missing and of extra points.
     """
-    from snarfcli.meshing.mesh import Mesh
-    from snarfcli.meshing.surfaces import field_surface
-    from snarfcli.rendering.camera import Camera
-    from snarfcli.rendering.render import render
-
     truth = Mesh(sequence.vertices(index), sequence.faces(index))
     camera = Camera.framing(truth.vertices)
     floor_y = float(truth.vertices[:, 1].min())
@@ -132,26 +129,25 @@ def draw_frame(
         log.warning("warning: nothing to draw for %s, frame %d: %s", sequence.name, sequence.frame_numbers[index], error)
         predicted = None
     pale = replace(truth, colors=np.full(truth.vertices.shape, _PALE, np.uint8))
-    pictures = [None if mesh is None else render(mesh, camera, size, floor_y=floor_y) for mesh in (truth, predicted, pale)]
+    true_picture, wrong_points = (render(mesh, camera, size, floor_y=floor_y) for mesh in (truth, pale))
+    prediction = None if predicted is None else render(predicted, camera, size, floor_y=floor_y)
     points, occupied = sequence.points(index), sequence.occupancies(index)
     inside = predict_inside(avatar, sequence, index, points)
     missing, extra = occupied & ~inside, inside & ~occupied
     for wrong, color in ((extra, EXTRA), (missing, MISSING)):
-        pictures[2] = _draw_points(pictures[2], camera.project(points[wrong], size, size), color)
-    return pictures, (int(missing.sum()), int(extra.sum()))
+        wrong_points = _draw_points(wrong_points, camera.project(points[wrong], size, size), color)
+    return [true_picture, prediction, wrong_points], (int(missing.sum()), int(extra.sum()))
 
 
 def _draw_points(picture: np.ndarray, projected: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
-    """Draw discs over a picture, whether or not a surface hides them: most missing points lie below it.
+    """Draw discs over a picture, also where a surface hides them, as most missing points lie below it.
 
     Args:
         picture: [H, W, 3] uint8.
         projected: [N, 3] pixel coordinates and depth.
-        color: sRGB.
+        color: sRGB, 0 to 255.
     """
-    from PIL import Image, ImageDraw
-
-    scale = 4  # PIL does not smooth edges, a reduction does
+    scale = 4  # drawn larger and reduced, since PIL does not smooth edges
     height, width = picture.shape[:2]
     mask = Image.new("L", (width * scale, height * scale))
     draw = ImageDraw.Draw(mask)

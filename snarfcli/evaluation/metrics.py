@@ -1,10 +1,10 @@
-"""Intersection over union of occupancy samples, frame by frame, and its means.
+"""Intersection over union of occupancy samples, per frame, and its means.
 
-Protocol (SNARF Sec. 4.1 and its released code): a frame's points are half uniform in a cube around the posed mesh, whose side
-is the longest side of the tight box times 1.1 (IoU bbox), and half near the surface (IoU surface). The IoU of each frame is
-computed on its own; what a paper's table states is the mean over all frames, so that a long sequence counts for more than
-a short one. The IoU of the tight box uses those uniform points that lie in the tight box of the posed mesh. Points that both
-call outside never count, so it differs from IoU bbox only by what the avatar adds outside that box, such as floating blobs.
+Protocol (SNARF Sec. 4.1 and its released code): half of a frame's points are uniform in a cube around the posed mesh, whose
+side is the longest side of the tight box times 1.1 (IoU bbox); the other half are near the surface (IoU surface). The IoU is
+computed per frame. The papers' tables state the mean over all frames, so a long sequence counts for more than a short one.
+The IoU of the tight box uses the uniform points in the tight box of the posed mesh. Points that both call outside never
+count, so it differs from IoU bbox only by what the avatar adds outside that box, such as floating blobs.
 """
 
 from __future__ import annotations
@@ -16,17 +16,20 @@ import numpy as np
 
 __all__ = ["FrameMetrics", "Summary", "group_by_sequence", "in_box", "iou", "mean_of_sequences", "summarise"]
 
+_COUNTS = ("points", "correspondences", "several", "without", "inside", "inside_without")
+_SUMMED = (*_COUNTS, "search_s", "shape_s", "total_s")  # over frames
+
 
 @dataclass(frozen=True)
 class FrameMetrics:
-    """What was measured on one frame."""
+    """Results of one frame."""
 
     sequence: str
-    """Name of its sequence."""
+    """Name of the sequence."""
     index: int
-    """Which of the sequence's samples."""
+    """Index of the frame in the samples."""
     frame: int
-    """Number of the frame in the motion, of which the samples may leave some out."""
+    """Number of the frame in the motion, of which the samples may omit some."""
     iou_bbox: float
     """IoU of the uniform points in the papers' cube, 0 to 1."""
     iou_surface: float
@@ -36,26 +39,26 @@ class FrameMetrics:
     points: int
     """Number of points."""
     correspondences: int
-    """Correspondences of all points together."""
+    """Number of correspondences of all points."""
     several: int
-    """Points with more than one correspondence: where the body touches or crosses itself."""
+    """Number of points with more than one correspondence: where the body touches or crosses itself."""
     without: int
-    """Points without a correspondence."""
+    """Number of points without a correspondence."""
     inside: int
-    """Points that truly are inside."""
+    """Number of points that are inside."""
     inside_without: int
-    """Points that truly are inside and have no correspondence: they cannot be predicted right."""
+    """Number of points that are inside and have no correspondence, so that they cannot be predicted correctly."""
     search_s: float
     """Seconds for the correspondence search."""
     shape_s: float
     """Seconds for the shape network."""
     total_s: float
-    """Seconds for both and what is around them."""
+    """Seconds for the whole query."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Means over frames; shares and times over all their points together."""
+    """Means over frames; shares and times over the points of all frames."""
 
     frames: int
     """Number of frames."""
@@ -76,24 +79,24 @@ class Summary:
     without: float
     """Share of points without a correspondence, 0 to 1."""
     inside_without: float
-    """Share of the truly inside points without a correspondence, 0 to 1; 0 if no point is inside."""
+    """Share of the inside points without a correspondence, 0 to 1; 0 if no point is inside."""
     search_s: float
     """Seconds for the correspondence search, all frames."""
     shape_s: float
     """Seconds for the shape network, all frames."""
     total_s: float
-    """Seconds for both and what is around them, all frames."""
+    """Seconds for the whole queries, all frames."""
 
 
 def iou(predicted: np.ndarray, occupied: np.ndarray, where: np.ndarray | None = None) -> np.ndarray:
     """Return the intersection over union of two sets of points, 1 where both are empty.
 
-    Two empty sets agree, and a mean must not break on a frame of which no point is inside.
+    Two empty sets agree; a frame without inside points must not break a mean.
 
     Args:
-        predicted: [..., N] bool, the points that are predicted to be inside.
-        occupied: [..., N] bool, the points that are inside.
-        where: [..., N] bool, the points that count; all by default.
+        predicted: [..., N] bool, points that are predicted to be inside.
+        occupied: [..., N] bool, points that are inside.
+        where: [..., N] bool, points that count; None for all.
 
     Returns:
         [...] float64, 0 to 1.
@@ -119,31 +122,18 @@ def iou(predicted: np.ndarray, occupied: np.ndarray, where: np.ndarray | None = 
 
 def in_box(points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Return which points [N, 3] lie in the box with corners lower [3] and upper [3], borders included, bool [N]."""
-    return ((points >= lower) & (points <= upper)).all(axis=-1)
+    return np.all((points >= lower) & (points <= upper), axis=-1)
 
 
 def summarise(frames: Sequence[FrameMetrics]) -> Summary:
-    """Take the mean of every IoU over frames.
+    """Return the means of the results of frames.
 
     Raises:
         ValueError: there is no frame.
     """
     if not frames:
         raise ValueError("frames: wanted at least one frame, got none")
-    total = {
-        name: sum(getattr(frame, name) for frame in frames)
-        for name in (
-            "points",
-            "correspondences",
-            "several",
-            "without",
-            "inside",
-            "inside_without",
-            "search_s",
-            "shape_s",
-            "total_s",
-        )  # fmt: skip
-    }
+    total = {name: sum(getattr(frame, name) for frame in frames) for name in _SUMMED}
     return Summary(
         frames=len(frames),
         points=total["points"],
@@ -162,7 +152,7 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
 
 
 def group_by_sequence(frames: Sequence[FrameMetrics]) -> dict[str, list[FrameMetrics]]:
-    """Return the frames of each sequence, in the order in which the sequences come first."""
+    """Return the frames of each sequence, in the order of their first frames."""
     groups: dict[str, list[FrameMetrics]] = {}
     for frame in frames:
         groups.setdefault(frame.sequence, []).append(frame)
@@ -170,7 +160,7 @@ def group_by_sequence(frames: Sequence[FrameMetrics]) -> dict[str, list[FrameMet
 
 
 def mean_of_sequences(frames: Sequence[FrameMetrics]) -> dict[str, float]:
-    """Return every IoU with each sequence counted once, whatever its length."""
+    """Return the mean of each IoU over sequences, each counted once regardless of its length."""
     summaries = [summarise(group) for group in group_by_sequence(frames).values()]
     names = ("iou_bbox", "iou_surface", "iou_tight_box")
     return {name: float(np.mean([getattr(summary, name) for summary in summaries])) for name in names}

@@ -1,4 +1,4 @@
-"""What an evaluation says: the table on the terminal and the content of `metrics.json`."""
+"""Report of an evaluation: the table on the terminal and the content of `metrics.json`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from snarfcli.evaluation.metrics import FrameMetrics, Summary, group_by_sequence
 __all__ = ["PROTOCOL", "REFERENCE_POINTS", "SPLITS", "EvaluationReport", "metrics_content", "plain", "table", "timings_text"]
 
 SPLITS = {"id": "in distribution", "ood": "out of distribution"}
-"""What can be evaluated: held-out motion of the training's kind, and poses unlike it."""
+"""Splits that can be evaluated: held-out motion like that of the training, and poses unlike it."""
 
 REFERENCE_POINTS = 200_000
 """Number of points for which the papers' table states times (Fast-SNARF table 1)."""
@@ -31,33 +31,33 @@ PROTOCOL = {
     "surfaces": "Chamfer: mean of the two mean distances; normals: mean cosine at nearest places; F-score: within 5 mm",
     "timings": "one untimed call first; times for 200,000 points are scaled from calls of points_per_frame points",
 }
-"""How the numbers are made, as `metrics.json` states it."""
+"""Definitions of the numbers, as stated in `metrics.json`."""
 
-_NAME_WIDTH = 30  # longer names of sequences are cut, so that the table fits 100 columns
+_NAME_WIDTH = 30  # longer names of sequences are cut; the table fits 100 columns
 
 
 @dataclass(frozen=True)
 class EvaluationReport:
-    """The measured frames of one avatar on one split, and where they came from."""
+    """The measured frames of one avatar on one split, and facts about them."""
 
     data: str
-    """Data set."""
+    """Name of the data set."""
     subject: str
-    """Subject."""
+    """Name of the subject."""
     model: str
-    """System."""
+    """Name of the system."""
     split: str
     """One of `SPLITS`."""
     frames: Sequence[FrameMetrics]
     """Measured frames, sequence by sequence."""
     wall_s: float
-    """Seconds for the whole of it, reading included."""
+    """Seconds for the whole evaluation, reading included."""
     machine: Mapping[str, Any]
     """`versions` and `machine`, see `snarfcli.runs.machine_facts`."""
     device: str = "cpu"
-    """Where the avatar computed."""
+    """Device on which the avatar computed."""
     training: Mapping[str, Any] = field(default_factory=dict)
-    """Facts about the avatar's making."""
+    """Facts about the avatar's training."""
     search: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the correspondence search."""
     samples: Mapping[str, Any] = field(default_factory=dict)
@@ -65,12 +65,12 @@ class EvaluationReport:
 
     @property
     def title(self) -> str:
-        """What was evaluated on what."""
+        """System, subject, data set and split."""
         return f"{self.model} of subject {self.subject}, data {self.data}, {SPLITS[self.split]} ({self.split})"
 
 
 def table(evaluation: EvaluationReport) -> str:
-    """Return the table of an evaluation: a row for each sequence, then the means, IoU and shares in percent."""
+    """Return the table of an evaluation: one row per sequence, then the means; IoU and shares in percent."""
     groups = {name: summarise(frames) for name, frames in group_by_sequence(evaluation.frames).items()}
     overall = summarise(evaluation.frames)
     width = min(_NAME_WIDTH, max(len(name) for name in [*groups, "mean of sequences"]))
@@ -102,7 +102,7 @@ def _row(name: str, summary: Summary, width: int) -> str:
 
 
 def timings_text(evaluation: EvaluationReport) -> str:
-    """Return two lines: the times for as many points as in the papers' table, and where and how long it ran."""
+    """Return two lines: times for the number of points of the papers' table; device and total time."""
     times = _timings(evaluation)
     machine = evaluation.machine["machine"]
     threads, frames = _counted(machine["threads"], "thread"), _counted(len(evaluation.frames), "frame")
@@ -133,11 +133,11 @@ def _timings(evaluation: EvaluationReport) -> dict[str, Any]:
 
 
 def metrics_content(evaluation: EvaluationReport, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what `metrics.json` holds, as plain JSON values; IoU and shares from 0 to 1, times in seconds unless named.
+    """Return the content of `metrics.json` as plain JSON values; IoU and shares from 0 to 1, times in seconds unless named.
 
     Args:
-        evaluation: what was measured.
-        settings: the resolved settings of the command; `seed` is among them.
+        evaluation: the results.
+        settings: resolved settings of the command, `seed` included.
     """
     overall = summarise(evaluation.frames)
     groups = group_by_sequence(evaluation.frames)
@@ -186,7 +186,7 @@ def _sequence(frames: Sequence[FrameMetrics]) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Return `value` as JSON can hold it: no tensors, arrays, paths or infinities; what is not finite becomes null."""
+    """Return `value` as plain JSON types: arrays and tensors become lists, paths text, and numbers that are not finite None."""
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple, set)):

@@ -1,21 +1,20 @@
-"""How far learned skinning weights are from the ones that the posed meshes were made with.
+"""Difference between learned skinning weights and those that made the posed meshes.
 
-Both are compared at the vertices of the body's mesh in the canonical pose. The difference of two rows of weights is half the
-sum of its absolute values (the total variation distance): the share of a vertex's weight that is on the wrong bones.
+Both are compared at the vertices of the body's mesh in the canonical pose. The difference of two rows of weights is the total
+variation distance, half the sum of the absolute differences: the share of a vertex's weight that is on wrong bones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from snarfcli.datasets.subjects import Template
-    from snarfcli.models.trained_field import TrainedField
+from snarfcli.datasets.subjects import Template
+from snarfcli.models.trained_field import TrainedField
 
 __all__ = ["compare_weights", "measure_weights", "weights_text"]
 
@@ -23,7 +22,7 @@ _POINTS_AT_ONCE = 65_536
 
 
 def measure_weights(avatar: TrainedField, template: Template | None) -> dict[str, Any] | None:
-    """Compare an avatar's weights with those of the subject's mesh; None where either has none.
+    """Compare an avatar's weights with those of the subject's mesh; None if either has none.
 
     Args:
         avatar: the avatar.
@@ -37,7 +36,7 @@ def measure_weights(avatar: TrainedField, template: Template | None) -> dict[str
 
 
 def compare_weights(learned: NDArray, true: NDArray) -> dict[str, Any]:
-    """Return what `metrics.json` says of learned weights [V, J] beside the true ones [V, J]; all shares from 0 to 1."""
+    """Compare learned weights [V, J] with true ones [V, J] for `metrics.json`; shares from 0 to 1."""
     share = np.abs(learned - true).sum(1) / 2
     return {
         "wrong_share": float(share.mean()),
@@ -48,7 +47,7 @@ def compare_weights(learned: NDArray, true: NDArray) -> dict[str, Any]:
 
 
 def weights_text(weights: Mapping[str, Any]) -> str:
-    """Return one line about what `measure_weights` found."""
+    """Return the results of `measure_weights` as one line."""
     return (
         f"skinning weights at {weights['vertices']:,} vertices: {100 * weights['wrong_share']:.1f} % on wrong bones "
         f"(95 % quantile {100 * weights['wrong_share_p95']:.1f} %), heaviest bone right at {100 * weights['right_bone']:.1f} %"

@@ -12,7 +12,7 @@ import torch
 
 from snarfcli.avatar import Avatar
 from snarfcli.errors import UserError
-from snarfcli.evaluation.evaluate import Samples, choose_frames
+from snarfcli.evaluation.evaluate import choose_frames
 from snarfcli.files import atomic_path, read_json
 from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.mesh import Mesh
@@ -22,7 +22,7 @@ from snarfcli.rendering import Camera, contact_sheet, render, write_png
 from snarfcli.reproduce.experiments import Row
 from snarfcli.reproduce.plans import Plan
 from snarfcli.reproduce.results import COLUMNS, Result, summarise
-from snarfcli.samples.store import SampleStore
+from snarfcli.samples.store import SampleStore, SequenceSamples
 
 __all__ = ["draw_sequences", "draw_stick_curves", "draw_stick_shapes", "draw_systems", "draw_weights"]
 
@@ -223,7 +223,7 @@ def _store(result: Result, split: str) -> SampleStore:
     return SampleStore.open(evaluation.data_root, evaluation.data, result.job.subject)
 
 
-def _frames(result: Result, split: str, count: int) -> Iterator[tuple[Samples, int]]:
+def _frames(result: Result, split: str, count: int) -> Iterator[tuple[SequenceSamples, int]]:
     """Yield frames of a split, evenly spaced over its sequences; none if the data has no such split."""
     try:
         sequences = _store(result, split).sequences("test" if split == "id" else "ood")
@@ -232,7 +232,7 @@ def _frames(result: Result, split: str, count: int) -> Iterator[tuple[Samples, i
     yield from choose_frames(sequences, count)
 
 
-def _predicted(avatar: Avatar, sequence: Samples, index: int, resolution: int) -> Mesh | None:
+def _predicted(avatar: Avatar, sequence: SequenceSamples, index: int, resolution: int) -> Mesh | None:
     pose, translation, transforms = (
         torch.as_tensor(values[index]) for values in (sequence.poses, sequence.translation, sequence.bone_transforms)
     )

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from snarfcli.bodies import Skeleton
-from snarfcli.evaluation.evaluate import Field, predict_inside
+from snarfcli.evaluation.evaluate import predict_inside
 from snarfcli.evaluation.metrics import iou
 from snarfcli.files import atomic_path
+from snarfcli.models.trained_field import TrainedField
 from snarfcli.samples.store import SampleStore, SequenceSamples
 from snarfcli.sampling import in_turned_over, winding_numbers
 
@@ -46,11 +47,13 @@ class StickPose:
     """Samples of a planar subject."""
     frame: int
     """Which of the sequence's frames."""
-    avatars: Mapping[str, Field | None]
+    avatars: Mapping[str, TrainedField | None]
     """The subject's avatar of each system by its label; None, or left out: there is none."""
 
 
-def extreme_poses(store: SampleStore, label: str, avatars: Mapping[str, Field | None], count: int = 2) -> list[StickPose]:
+def extreme_poses(
+    store: SampleStore, label: str, avatars: Mapping[str, TrainedField | None], count: int = 2
+) -> list[StickPose]:
     """Choose rows for `draw_shapes`, out of distribution: of each stretch of frames the one in which most overlaps.
 
     Args:
@@ -214,7 +217,9 @@ def _overlap(sequence: SequenceSamples, index: int) -> int:
     return int((winding_numbers(sequence.vertices(index), sequence.faces(index), points) > 1.5).sum())
 
 
-def _draw_prediction(axis: Axes, row: StickPose, avatar: Field, lattice: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+def _draw_prediction(
+    axis: Axes, row: StickPose, avatar: TrainedField, lattice: np.ndarray, x: np.ndarray, y: np.ndarray
+) -> None:
     """Fill what an avatar calls inside, and write the frame's IoU below."""
     import torch
 

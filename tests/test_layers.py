@@ -27,6 +27,7 @@ LAYERS = (
         "checks",
         "files",
         "formats",
+        "locks",
         "native",
         "parallel",
         "precision",

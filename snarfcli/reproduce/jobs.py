@@ -14,7 +14,7 @@ from typing import Any
 
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
-from snarfcli.reproduce.locks import locked
+from snarfcli.locks import locked
 from snarfcli.reproduce.plans import Evaluation, Job
 from snarfcli.samples.store import samples_folder
 

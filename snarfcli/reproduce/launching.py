@@ -26,8 +26,8 @@ from typing import Any
 
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
+from snarfcli.locks import one_of
 from snarfcli.reproduce.jobs import Status, run_job
-from snarfcli.reproduce.locks import one_of
 from snarfcli.reproduce.plans import Job
 from snarfcli.settings import quote
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, file_digest, read_json, write_json
+from snarfcli.locks import try_lock
 from snarfcli.samples.store import FORMAT_VERSION, SEQUENCE_FILES, SPLITS, check_format
 from snarfcli.sampling.points import FrameSamples
 
@@ -223,29 +224,20 @@ def remove_leftovers(folder: Path) -> None:
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Make `folder` and hold it alone while the block runs, where the system can lock folders.
+    """Create `folder` and lock it while the block runs; the lock is a hidden file beside it.
 
     Raises:
-        UserError: another process holds it.
-        OSError: the folder cannot be made.
+        UserError: another process holds the lock.
+        OSError: the folder cannot be created.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    release = try_lock(folder.with_name(f".{folder.name}.preprocess.lock"))
+    if release is None:
+        raise UserError(f"another snarf preprocess is working in {folder}; wait for it, or end it first")
     try:
-        import fcntl
-    except ImportError:  # Windows
-        yield
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(f"another snarf preprocess is working in {folder}; wait for it, or end it first") from None
-        except OSError:
-            pass  # some network file systems have no locks
         yield
     finally:
-        os.close(descriptor)
+        release()
 
 
 def write_manifest(folder: Path, header: Mapping[str, Any], sequences: list[dict[str, Any]]) -> dict[str, Any]:

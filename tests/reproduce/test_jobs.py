@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from made_up_runs import fake_metrics, fake_plan, fake_samples
 
 from snarfcli.files import write_json
 from snarfcli.reproduce.jobs import LOG, STATUS, JobStopped, read_status, run_command, run_job
-from snarfcli.reproduce.locks import locked, one_of
 from snarfcli.reproduce.results import collect
 
 
@@ -129,7 +127,8 @@ def test_a_diverged_run_stays_so(job):
     assert run_job(job, runner=Diverging(job, train=2)).state == "diverged"
     assert collect(job).state == "diverged"
     again = Player(job)
-    assert run_job(job, runner=again).state == "diverged" and again.calls == [], "the same seed would lead there again"
+    assert run_job(job, runner=again).state == "diverged"
+    assert again.calls == [], "the same seed would lead there again"
 
 
 def test_a_new_avatar_is_evaluated_anew(job):
@@ -192,24 +191,3 @@ def test_a_command_that_is_killed_is_named(job):
         return -signal.SIGKILL
 
     assert run_job(job, runner=killed).reason == "ended by SIGKILL (out of memory?)"
-
-
-def test_a_lock_keeps_the_second_out_until_the_first_is_done(tmp_path):
-    pytest.importorskip("fcntl")
-    events = []
-
-    def second():
-        with locked(tmp_path / "lock"):
-            events.append("second")
-
-    with locked(tmp_path / "lock"):
-        thread = threading.Thread(target=second)
-        thread.start()
-        with pytest.raises(JobStopped), locked(tmp_path / "lock", check=lambda: (_ for _ in ()).throw(JobStopped())):
-            pass
-        events.append("first")
-    thread.join()
-    assert events == ["first", "second"]
-    with one_of([tmp_path / "a", tmp_path / "b"]), one_of([tmp_path / "a", tmp_path / "b"]):
-        events.append("two slots")
-    assert events[-1] == "two slots"

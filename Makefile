@@ -1,4 +1,4 @@
-# Each target sets up what it needs: in the active virtual environment, or in .venv where none is active.
+# Each target installs what it needs: into the active virtual environment, or into .venv if none is active.
 # Another Python: make PYTHON=python3.12 test
 SHELL := /bin/sh
 PYTHON ?= python3
@@ -7,16 +7,18 @@ INSTALLED := $(VENV)/.snarf-installed
 SNARF := $(VENV)/bin/snarf
 SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
+C_FAMILY = $(shell find csrc tests/native -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
 
-.PHONY: help setup demo test fuzz sanitize lint bench clean
+.PHONY: help setup demo test fuzz sanitize lint format bench clean
 
 help:
 	@echo "make setup     install snarf into $(VENV)"
-	@echo "make demo      the whole job on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
+	@echo "make demo      run the whole pipeline on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
 	@echo "make test      run the tests"
-	@echo "make fuzz      feed every reader of foreign files with 20,000 broken ones"
-	@echo "make sanitize  run the deformer's tests on a library built with address and undefined-behaviour checks (Linux)"
-	@echo "make lint      check the style of the code"
+	@echo "make fuzz      read 20,000 damaged files with every file reader"
+	@echo "make sanitize  test the native library built with AddressSanitizer and UndefinedBehaviorSanitizer (Linux)"
+	@echo "make lint      check style, format and types of the code"
+	@echo "make format    format the code"
 	@echo "make bench     measure the searches, preprocessing, batches, a training step, evaluation and mesh extraction"
 	@echo "make clean     remove .venv, builds, samples and results"
 
@@ -45,8 +47,16 @@ sanitize: $(INSTALLED)
 
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/clang-format --dry-run --Werror $(C_FAMILY)
+	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
 
-# The commands set this too: else PyTorch's idle threads keep the cores from the native library.
+format: $(INSTALLED)
+	$(VENV)/bin/ruff check --select I --fix .
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/clang-format -i $(C_FAMILY)
+
+# As the commands do: idle PyTorch threads must not occupy the cores that the native library needs.
 bench: export OMP_WAIT_POLICY = PASSIVE
 bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_search.py

@@ -46,13 +46,15 @@ def main() -> None:
     rows = []
     for name, search in SEARCHES.items():
         avatar.model.deformer.search = search
-        fields = []
-        seconds = timed(lambda fields=fields: fields.append(avatar.query(points, transforms, pose)), options.repeats)
-        found = fields[-1]
+        search_s = timed(lambda: avatar.find(points, transforms, pose), options.repeats)
+        roots = avatar.find(points, transforms, pose)
+        shape_s = timed(lambda roots=roots: avatar.shape_at(roots, pose), options.repeats)
+        seconds = timed(lambda: avatar.query(points, transforms, pose), options.repeats)
+        found = avatar.shape_at(roots, pose)
         rows.append([
             name,
-            median_and_spread([field.search_s for field in fields[1:]]),
-            median_and_spread([field.shape_s for field in fields[1:]]),
+            median_and_spread(search_s),
+            median_and_spread(shape_s),
             f"{1000 * statistics.median(seconds):.0f}",
             f"{found.correspondences:,}",
             f"{100 * float(found.found.float().mean()):.1f} %",

@@ -5,6 +5,7 @@ python benchmarks/bm_training.py            needs the samples of `snarf preproce
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import torch
@@ -13,9 +14,9 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from snarfcli.commands.train import TrainConfig, new_trainer
+from snarfcli.hydra_config.schema import config_folder, register_schemas
 from snarfcli.precision import matmul_precision
 from snarfcli.samples.store import SampleStore
-from snarfcli.settings import config_folder, register_schemas
 from snarfcli.training.losses import occupancy_loss
 
 
@@ -30,9 +31,12 @@ def measure(name: str, search: str, store: SampleStore, steps: int, repeats: int
     parts: dict[str, list[float]] = {"search": [], "shape": []}
 
     def forward():
-        field = trainer.model(batch.points, batch.bone_transforms, batch.pose, trainer.config.precision)
-        parts["search"].append(field.search_s)
-        parts["shape"].append(field.shape_s)
+        start = time.perf_counter()
+        found = trainer.model.find(batch.points, batch.bone_transforms, batch.pose)
+        searched = time.perf_counter()
+        field = trainer.model.shape_at(found, batch.pose, trainer.config.precision)
+        parts["search"].append(searched - start)
+        parts["shape"].append(time.perf_counter() - searched)
         return occupancy_loss(field.logits, batch.occupied, field.found)
 
     def forward_and_backward():

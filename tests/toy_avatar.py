@@ -55,7 +55,7 @@ class ToyAvatar(AnalyticAvatar):
             best = logits if best is None else torch.maximum(best, logits)
         assert best is not None
         found = best[None] > NO_CORRESPONDENCE
-        return FieldSamples(best[None], found, found.long(), 0.0, 0.0)
+        return FieldSamples(best[None], found, found.long())
 
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
         tips = torch.tensor([[0.0, 0, 0], [LENGTH, 0, 0], [2 * LENGTH, 0, 0]])

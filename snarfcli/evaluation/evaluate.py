@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -12,53 +11,17 @@ from torch import Tensor
 
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import FrameMetrics, in_box, iou
+from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
+from snarfcli.samples.store import SequenceSamples
 
-__all__ = ["Field", "FieldValues", "Samples", "choose_frames", "choose_points", "evaluate", "measure_frame", "predict_inside"]
+__all__ = ["choose_frames", "choose_points", "evaluate", "measure_frame", "predict_inside"]
 
-_POINTS_AT_ONCE = 100_000  # points in one query, which bounds the memory of the search; frames have 20,000 by default
-
-
-class FieldValues(Protocol):
-    """What is needed of an answer of the field; see `snarfcli.models.system.FieldSamples`."""
-
-    logits: Tensor
-    counts: Tensor
-    search_s: float
-    shape_s: float
+_POINTS_AT_ONCE = 100_000  # points in one query, bounds the memory of the search; a frame has 20,000 by default
 
 
-class Field(Protocol):
-    """What is needed of an avatar."""
-
-    def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> FieldValues: ...
-
-
-class Samples(Protocol):
-    """What is needed of the samples of a sequence; see `snarfcli.samples.store.SequenceSamples`."""
-
-    name: str
-    num_frames: int
-    num_points: int
-    num_uniform: int
-    poses: np.ndarray
-    translation: np.ndarray
-    bone_transforms: np.ndarray
-    frame_numbers: np.ndarray
-
-    def points(self, frames: int, index: np.ndarray | None = None) -> np.ndarray: ...
-
-    def occupancies(self, frames: int, index: np.ndarray | None = None) -> np.ndarray: ...
-
-    def box(self, frame: int) -> tuple[np.ndarray, np.ndarray]: ...
-
-    def vertices(self, frame: int) -> np.ndarray: ...
-
-    def faces(self, frame: int) -> np.ndarray: ...
-
-
-def choose_frames(sequences: Sequence[Samples], max_frames: int | None = None) -> list[tuple[Samples, int]]:
-    """Return pairs of a sequence and the index of a frame: all, or `max_frames` evenly spaced over all sequences.
+def choose_frames(sequences: Sequence[SequenceSamples], max_frames: int | None = None) -> list[tuple[SequenceSamples, int]]:
+    """Return pairs of a sequence and a frame index: all frames, or `max_frames` of them, evenly spaced over all sequences.
 
     Raises:
         UserError: `max_frames` is not positive, or the sequences have no frames.
@@ -70,19 +33,19 @@ def choose_frames(sequences: Sequence[Samples], max_frames: int | None = None) -
         raise UserError('there are no frames to evaluate; run "snarf preprocess" again with overwrite=true')
     if max_frames is None or max_frames >= len(frames):
         return frames
-    # in the middle of equal stretches, not at their ends, where a motion often begins and ends at rest
+    # The middles of equal stretches, not their ends: a motion often begins and ends at rest.
     chosen = ((np.arange(max_frames) + 0.5) * len(frames) / max_frames).astype(int)
     return [frames[index] for index in chosen]
 
 
 def choose_points(num_points: int, num_uniform: int, count: int | None, seed: int) -> np.ndarray | None:
-    """Return the sorted numbers of `count` points of a frame, half of them uniform, half near the surface; None for all.
+    """Return the sorted indices of `count` points of a frame, half of them uniform, half near the surface; None for all.
 
     Args:
-        num_points: points of a frame.
-        num_uniform: how many of them are uniform; they come first.
-        count: number of points, null for all.
-        seed: chooses the points; frames are sampled independently, so the same numbers serve all of them.
+        num_points: number of points per frame.
+        num_uniform: number of uniform points, which come first.
+        count: number of points to choose; None for all.
+        seed: of the choice. All frames use the same indices, since their points are independent.
 
     Raises:
         UserError: `count` is less than 2.
@@ -98,30 +61,30 @@ def choose_points(num_points: int, num_uniform: int, count: int | None, seed: in
 
 
 def evaluate(
-    avatar: Field,
-    sequences: Sequence[Samples],
+    avatar: TrainedField,
+    sequences: Sequence[SequenceSamples],
     *,
     max_frames: int | None = None,
     points: int | None = None,
     seed: int = 0,
     desc: str = "eval",
 ) -> list[FrameMetrics]:
-    """Measure the avatar on the frames of all sequences, one after the other.
+    """Measure the avatar on the frames of all sequences.
 
     Args:
-        avatar: the field; a point is predicted to be inside where its logit is above 0.
+        avatar: predicts that a point is inside where its logit is above 0.
         sequences: samples.
-        max_frames: so many frames, evenly spaced over all sequences.
-        points: so many points of each frame.
+        max_frames: maximum number of frames, evenly spaced over all sequences; None for all.
+        points: maximum number of points per frame; None for all.
         seed: of the choice of points.
-        desc: what the progress line says.
+        desc: label of the progress line.
 
     Raises:
         UserError: a number is out of range, or there are no frames.
     """
     frames = choose_frames(sequences, max_frames)
     first, _ = frames[0]
-    # The first call pays for the allocation of memory and the choice of algorithms, which is no property of the avatar.
+    # The first call also allocates memory and chooses algorithms, so its times are not used.
     measure_frame(avatar, *frames[0], choose_points(first.num_points, first.num_uniform, points, seed))
     measured = []
     for sequence, index in progress(frames, desc=desc, unit="frames"):
@@ -130,14 +93,16 @@ def evaluate(
     return measured
 
 
-def measure_frame(avatar: Field, sequence: Samples, index: int, chosen: np.ndarray | None = None) -> FrameMetrics:
+def measure_frame(
+    avatar: TrainedField, sequence: SequenceSamples, index: int, chosen: np.ndarray | None = None
+) -> FrameMetrics:
     """Measure the avatar on one frame.
 
     Args:
-        avatar: the field.
+        avatar: see `evaluate`.
         sequence: samples.
-        index: frame.
-        chosen: sorted numbers of the points to take, all if None.
+        index: frame index.
+        chosen: sorted indices of the points to use; None for all.
     """
     points, occupied = sequence.points(index, chosen), sequence.occupancies(index, chosen)
     uniform = sequence.num_uniform if chosen is None else int(np.searchsorted(chosen, sequence.num_uniform))
@@ -162,36 +127,40 @@ def measure_frame(avatar: Field, sequence: Samples, index: int, chosen: np.ndarr
     )
 
 
-def predict_inside(avatar: Field, sequence: Samples, index: int, points: np.ndarray) -> np.ndarray:
+def predict_inside(avatar: TrainedField, sequence: SequenceSamples, index: int, points: np.ndarray) -> np.ndarray:
     """Return which points [N, 3] of one frame the avatar predicts to be inside, bool [N]."""
     transforms, pose = _posed(sequence, index)
     parts = torch.as_tensor(points).split(_POINTS_AT_ONCE)
     return np.concatenate([(avatar.query(part[None], transforms, pose).logits[0] > 0).cpu().numpy() for part in parts])
 
 
-def _posed(sequence: Samples, index: int) -> tuple[Tensor, Tensor]:
+def _posed(sequence: SequenceSamples, index: int) -> tuple[Tensor, Tensor]:
     """Return the bone transforms [1, J, 4, 4] and the pose [1, J, 3] of one frame."""
     return torch.as_tensor(sequence.bone_transforms[index])[None], torch.as_tensor(sequence.poses[index])[None]
 
 
 def _query(
-    avatar: Field, sequence: Samples, index: int, points: np.ndarray
+    avatar: TrainedField, sequence: SequenceSamples, index: int, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float, float, float]:
     """Return which points [N, 3] are inside, bool [N], how many correspondences each has, [N], and the seconds it took."""
     transforms, pose = _posed(sequence, index)
     inside, counts, search_s, shape_s, total_s = [], [], 0.0, 0.0, 0.0
     for part in torch.as_tensor(points).split(_POINTS_AT_ONCE):
-        start = time.perf_counter()
-        values = avatar.query(part[None], transforms, pose)
-        on_gpu = values.logits.is_cuda
-        if on_gpu:
-            torch.cuda.synchronize(values.logits.device)
-        seconds = time.perf_counter() - start
-        total_s += seconds
-        search_s += values.search_s
-        # The search hands over a number of roots, so it is over when its clock stops; what comes after it on a GPU is only
-        # queued by then, so the rest of the time is the network's.
-        shape_s += max(seconds - values.search_s, 0.0) if on_gpu else values.shape_s
+        start = _time_s(avatar.device)
+        found = avatar.find(part[None], transforms, pose)
+        searched = _time_s(avatar.device)
+        values = avatar.shape_at(found, pose)
+        evaluated = _time_s(avatar.device)
         inside.append((values.logits[0] > 0).cpu().numpy())
         counts.append(values.counts[0].cpu().numpy())
+        search_s += searched - start
+        shape_s += evaluated - searched
+        total_s += evaluated - start
     return np.concatenate(inside), np.concatenate(counts), search_s, shape_s, total_s
+
+
+def _time_s(device: torch.device) -> float:
+    """Return the time in seconds when all work so far is done: a GPU only queues it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -17,7 +16,7 @@ from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.settings import AvatarConfig, ModelConfig
-from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, MeshTemplate, System
+from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, MeshTemplate, System
 
 __all__ = ["FastSnarf", "Snarf", "blend"]
 
@@ -28,6 +27,13 @@ _GROWTH_LOGIT = -3.0  # what might be occupied in training: 5 %
 _FINAL_M = 0.04
 _FINAL_LOGIT = -2.0  # what might be occupied afterwards, in a pose not sampled: 12 %
 _SURFACE_MOVES_M = 0.06  # how far the pose may move the canonical surface
+
+
+@dataclass(frozen=True)
+class FoundRoots(Found):
+    """All canonical points that forward skinning moves onto the posed points."""
+
+    roots: Correspondences
 
 
 class FastSnarf(System):
@@ -74,25 +80,19 @@ class FastSnarf(System):
         self.register_buffer("_canonical_pose", skeleton.canonical_pose.float(), persistent=False)
         self._body_cells: Tensor | None = None
 
-    def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:
-        """Evaluate the posed field: blended over the correspondences in training, their maximum otherwise.
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
+        return FoundRoots(self.deformer(points, bone_transforms))
 
-        Args:
-            points: [B, N, 3], posed space, metres.
-            bone_transforms: [B, J, 4, 4], canonical to posed.
-            pose: [B, J, 3] axis-angle, radians.
-            precision: of the shape network (see `PRECISIONS`); the search always runs in full float32.
+    def shape_at(self, found: FoundRoots, pose: Tensor, precision: str = "highest") -> FieldSamples:
+        """Evaluate the shape network at the roots, and blend over those of a point in training, else take their maximum.
 
         Source: SNARF Eq. 9.
         """
-        start = time.perf_counter()
-        found = self.deformer(points, bone_transforms)
-        after_search = time.perf_counter()
-        logits = self.canonical_logits(found.canonical, self.condition(pose), found.pose, precision)
-        combined = blend(logits, found, self.config.model) if self.training else found.maximum(logits, NO_CORRESPONDENCE)
-        done = time.perf_counter()
-        counts = found.counts
-        return FieldSamples(combined, counts > 0, counts, after_search - start, done - after_search)
+        roots = found.roots
+        logits = self.canonical_logits(roots.canonical, self.condition(pose), roots.pose, precision)
+        combined = blend(logits, roots, self.config.model) if self.training else roots.maximum(logits, NO_CORRESPONDENCE)
+        counts = roots.counts
+        return FieldSamples(combined, counts > 0, counts)
 
     @torch.no_grad()
     def occupied_cells(self, pose: Tensor, threshold: float = 0.0, reach_m: float = 0.0, precision: str = "highest") -> Tensor:

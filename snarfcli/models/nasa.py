@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -19,7 +18,7 @@ from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
 from snarfcli.models.settings import AvatarConfig, ModelConfig
-from snarfcli.models.system import FieldSamples, MeshTemplate
+from snarfcli.models.system import FieldSamples, Found, MeshTemplate
 from snarfcli.precision import network_precision
 from snarfcli.segments import distance_to_segments
 from snarfcli.shape.network import LOGITS_PER_METRE
@@ -33,6 +32,18 @@ _POINTS_AT_ONCE = {"cpu": 1024, "cuda": 65_536}  # each is evaluated for every p
 # after 300 quick steps was 56 %, with this 63 %. The root joint in a bone's frame: how far it is away.
 _UNIT_M = 0.15
 _ROOT_UNIT_M = 0.5
+
+
+@dataclass(frozen=True)
+class BoneFrames(Found):
+    """The frames of the bones in B poses, in which the parts see the posed points."""
+
+    points: Tensor
+    """[B, N, 3], posed, metres."""
+    local_from_posed: Tensor
+    """Takes posed points into the frame of each bone, [B, J, 3, 4], metres."""
+    root: Tensor
+    """The root joint in the frame of each bone, [B, J, 3], metres."""
 
 
 class Nasa(PointwiseSystem):
@@ -60,30 +71,30 @@ class Nasa(PointwiseSystem):
     def _make_shape(self, bones: Tensor) -> nn.Module:
         return PartNetworks(self.config.model, self.num_bones)
 
-    def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:
-        start = time.perf_counter()
-        inverse, code = self._bone_frames(bone_transforms)
-        after = self.time_s()
-        logits = self._part_logits(points, inverse, code, precision).amax(1)
-        return every_point(logits, after - start, time.perf_counter() - after)
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
+        return self._bone_frames(points, bone_transforms)
+
+    def shape_at(self, found: BoneFrames, pose: Tensor, precision: str = "highest") -> FieldSamples:
+        return every_point(self._part_logits(found, precision).amax(1))
 
     def part_logits(self, points: Tensor, bone_transforms: Tensor, precision: str = "highest") -> Tensor:
         """Return the logits [B, J, N] of every part at posed points [B, N, 3]."""
-        return self._part_logits(points, *self._bone_frames(bone_transforms), precision)
+        return self._part_logits(self._bone_frames(points, bone_transforms), precision)
 
-    def _bone_frames(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what takes posed points into the frame of each bone [B, J, 3, 4], and the root joint there [B, J, 3]."""
+    def _bone_frames(self, points: Tensor, bone_transforms: Tensor) -> BoneFrames:
         inverse = invert_rigid(bone_transforms)
         inverse = torch.cat([inverse[..., :3, :3], inverse[..., :3, 3:] - self._joints[:, :, None]], -1)
         root = bone_transforms[:, 0, :3, :3] @ self._joints[0] + bone_transforms[:, 0, :3, 3]
-        return inverse, (inverse[..., :3] @ root[:, None, :, None])[..., 0] + inverse[..., 3]
+        local_root = (inverse[..., :3] @ root[:, None, :, None])[..., 0] + inverse[..., 3]
+        return BoneFrames(points, inverse, local_root)
 
-    def _part_logits(self, points: Tensor, inverse: Tensor, code: Tensor, precision: str) -> Tensor:
+    def _part_logits(self, frames: BoneFrames, precision: str) -> Tensor:
+        points, inverse = frames.points, frames.local_from_posed
         logits = []
         for part in points.split(max(1, _POINTS_AT_ONCE[points.device.type] // len(points)), 1):
             local = part[:, None] @ inverse[..., :3].transpose(-1, -2) + inverse[..., None, :, 3]
             with network_precision(precision, points.device):
-                logits.append(self.shape(local / _UNIT_M, code / _ROOT_UNIT_M).to(points.dtype))
+                logits.append(self.shape(local / _UNIT_M, frames.root / _ROOT_UNIT_M).to(points.dtype))
             if self.config.shape.prior_radius_m is not None:
                 logits[-1] = logits[-1] + self._capsules(local)
         return torch.cat(logits, 2)

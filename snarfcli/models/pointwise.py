@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import time
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -14,7 +14,7 @@ from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.models.extent import bone_segments
 from snarfcli.models.settings import AvatarConfig
-from snarfcli.models.system import FieldSamples, MeshTemplate, System
+from snarfcli.models.system import FieldSamples, Found, MeshTemplate, System
 from snarfcli.precision import matmul_precision
 from snarfcli.segments import distance_to_segments
 
@@ -22,6 +22,16 @@ __all__ = ["PointwiseSystem", "PosedNetwork", "every_point", "into_root_frame", 
 
 _LEAST_DETERMINANT = 0.01  # of blended rotations; those of neighbouring bones bent by 150 degrees have 0.07
 _BOX_MARGIN_M = 0.06  # how far the pose may move the surface beyond where it lies in the training frames
+
+
+@dataclass(frozen=True)
+class FoundPoints(Found):
+    """One canonical point for each of B x N posed points."""
+
+    canonical: Tensor
+    """[B, N, 3], metres."""
+    weights: Tensor | None
+    """Skinning weights [B, N, J] that led there, in systems that have them."""
 
 
 class PointwiseSystem(System):
@@ -57,22 +67,16 @@ class PointwiseSystem(System):
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         """Make what the system has besides its shape; the arguments are those of the constructor."""
 
-    def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:
-        start = time.perf_counter()
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
         with matmul_precision("highest"), torch.autocast(points.device.type, enabled=False):
-            canonical, weights = self.canonical_points(points, bone_transforms, pose)
-        after = self.time_s()
-        index = torch.arange(len(points), device=points.device).repeat_interleave(points.shape[1])
-        weights = None if weights is None else weights.flatten(0, 1)
-        logits = self.canonical_logits(canonical.flatten(0, 1), self.condition(pose), index, precision, weights)
-        done = time.perf_counter()
-        return every_point(logits.reshape(points.shape[:2]), after - start, done - after)
+            return FoundPoints(*self.canonical_points(points, bone_transforms, pose))
 
-    def time_s(self) -> float:
-        """Return the time in seconds. A GPU's work so far is over by then, but in training, where nobody asks for times."""
-        if self.lower.is_cuda and not self.training:
-            torch.cuda.synchronize(self.lower.device)
-        return time.perf_counter()
+    def shape_at(self, found: FoundPoints, pose: Tensor, precision: str = "highest") -> FieldSamples:
+        batch, count = found.canonical.shape[:2]
+        index = torch.arange(batch, device=found.canonical.device).repeat_interleave(count)
+        weights = None if found.weights is None else found.weights.flatten(0, 1)
+        logits = self.canonical_logits(found.canonical.flatten(0, 1), self.condition(pose), index, precision, weights)
+        return every_point(logits.reshape(batch, count))
 
     def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return where posed points [B, N, 3] come from, [B, N, 3], and by which skinning weights [B, N, J], if by any."""
@@ -127,10 +131,10 @@ class PosedNetwork(nn.Module):
         return h
 
 
-def every_point(logits: Tensor, search_s: float, shape_s: float) -> FieldSamples:
+def every_point(logits: Tensor) -> FieldSamples:
     """Return samples [B, N] in which each point has one correspondence."""
     counts = torch.ones_like(logits, dtype=torch.long)
-    return FieldSamples(logits, counts > 0, counts, search_s, shape_s)
+    return FieldSamples(logits, counts > 0, counts)
 
 
 def into_root_frame(points: Tensor, bone_transforms: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from snarfcli.precision import network_precision
 from snarfcli.shape import CONDITIONS, OccupancyNetwork, joints_of_bones
 from snarfcli.shape.inference import can_evaluate, evaluate
 
-__all__ = ["NO_CORRESPONDENCE", "FieldSamples", "MeshTemplate", "System", "pose_angles"]
+__all__ = ["NO_CORRESPONDENCE", "FieldSamples", "Found", "MeshTemplate", "System", "pose_angles"]
 
 NO_CORRESPONDENCE = -30.0
 """Logit of a point that no canonical point is moved onto: certainly outside."""
@@ -35,16 +35,16 @@ class FieldSamples:
     found: Tensor
     """Which points have a correspondence, bool [B, N]."""
     counts: Tensor
-    """How many correspondences each point has, [B, N]."""
-    search_s: float
-    """Seconds spent on going back to the canonical frame."""
-    shape_s: float
-    """Seconds spent on the shape network."""
+    """Number of correspondences of each point, [B, N]."""
 
     @property
     def correspondences(self) -> int:
         """Number of correspondences of all points."""
         return int(self.counts.sum())
+
+
+class Found:
+    """Where posed points come from: what a system's `find` returns and its `shape_at` takes."""
 
 
 @dataclass(frozen=True)
@@ -108,14 +108,22 @@ class System(nn.Module):
 
     # ---------------------------------------------------------------- the field
     def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:
-        """Evaluate the posed field.
+        """Evaluate the posed field: `find`, then `shape_at`.
 
         Args:
             points: [B, N, 3], posed space, metres.
             bone_transforms: [B, J, 4, 4], canonical to posed.
             pose: [B, J, 3] axis-angle, radians.
-            precision: of the shape network (see `PRECISIONS`); going back to the canonical frame is always in full float32.
+            precision: of the shape network (see `PRECISIONS`); `find` always runs in full float32.
         """
+        return self.shape_at(self.find(points, bone_transforms, pose), pose, precision)
+
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
+        """Go back to the canonical frame, in full float32; arguments as in `forward`."""
+        raise NotImplementedError
+
+    def shape_at(self, found: Found, pose: Tensor, precision: str = "highest") -> FieldSamples:
+        """Evaluate the shape network where `find` has led."""
         raise NotImplementedError
 
     def condition(self, pose: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from snarfcli.models.nasa import Nasa, Piecewise
 from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.smpl_nn import SmplNN
-from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, MeshTemplate, System
+from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, MeshTemplate, System
 
 __all__ = ["SYSTEMS", "TrainedField"]
 
@@ -174,10 +174,19 @@ class TrainedField:
             raise ValueError("pose must be finite, got NaN or infinite values")
         return self.skeleton.posed_from_canonical(pose, translation).to(self.device)
 
-    @torch.no_grad()
     def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> FieldSamples:
         """Evaluate the posed field at points [B, N, 3] under bone transforms [B, J, 4, 4] and pose [B, J, 3]."""
-        return self.model(points.to(self.device), bone_transforms.to(self.device), pose.to(self.device))
+        return self.shape_at(self.find(points, bone_transforms, pose), pose)
+
+    @torch.no_grad()
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
+        """Go back to the canonical frame, the first half of `query`."""
+        return self.model.find(points.to(self.device), bone_transforms.to(self.device), pose.to(self.device))
+
+    @torch.no_grad()
+    def shape_at(self, found: Found, pose: Tensor) -> FieldSamples:
+        """Evaluate the shape network where `find` has led, the second half of `query`."""
+        return self.model.shape_at(found, pose.to(self.device))
 
     def occupancy(self, points: Tensor, pose: Tensor, translation: Tensor | None = None) -> Tensor:
         """Return occupancy probabilities [B, N] at posed points [B, N, 3], metres.

@@ -1,11 +1,11 @@
-"""The arrays of a pickle, made from their parts once these are known to fit."""
+"""Create the arrays of a pickle from their parts, after checking that these fit together."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy.sparse
@@ -16,72 +16,93 @@ from snarfcli.formats.pickle_tree import PickleError, shown
 __all__ = ["SPARSE_FORMS", "checked_shape", "make_array", "make_dtype", "make_sparse", "select"]
 
 SPARSE_FORMS = {"csc": scipy.sparse.csc_matrix, "csr": scipy.sparse.csr_matrix, "coo": scipy.sparse.coo_matrix}
-# Numbers and text. `O8` is what Python 2 calls an object.
+# Numbers and text. `O8` is the type of objects in Python 2.
 _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,6}|O[48]?)")
 
 
 def make_dtype(code: Any, order: Any) -> np.dtype:
-    """Make the type of an array from its code, for example `f8`, and its byte order."""
+    """Return the type of an array from its code, for example `f8`, and its byte order."""
     match = _DTYPE.fullmatch(code) if isinstance(code, str) else None
     if match is None:
-        raise PickleError(f"holds an array of type {shown(code)}, wanted numbers or text")
+        raise PickleError(f"array type: wanted numbers or text, got {shown(code)}")
     if order is None:
         order = code[0] if code[0] in "<>|=" else "="
     if order not in ("<", ">", "|", "="):
-        raise PickleError("holds an array without a byte order; it is damaged")
+        raise PickleError("has an array without a byte order; it is damaged")
     return np.dtype(object if match[1][0] == "O" else order + match[1])
 
 
 def checked_shape(shape: Any) -> tuple[int, ...]:
-    """Return the shape of an array as a tuple, if it is one."""
+    """Return the shape of an array as a tuple.
+
+    Raises:
+        PickleError: it is not a valid shape.
+    """
     sizes = (shape,) if type(shape) is int else shape
     if not isinstance(sizes, tuple) or len(sizes) > 32 or any(type(n) is not int or not 0 <= n < 2**40 for n in sizes):
-        raise PickleError("holds an array without a proper shape; it is damaged")
+        raise PickleError("has an array without a valid shape; it is damaged")
     return sizes
 
 
-def make_array(shape: tuple[int, ...], dtype: np.dtype, order: str, view: memoryview) -> NDArray:
-    """Make an array of numbers or text that owns its memory, aligned and in this machine's byte order."""
+def make_array(shape: tuple[int, ...], dtype: np.dtype, order: Literal["C", "F"], view: memoryview) -> NDArray:
+    """Return an array of numbers or text that owns its memory, aligned and in native byte order.
+
+    Args:
+        shape: of the array.
+        dtype: of the values in `view`.
+        order: C for rows first, F for columns first.
+        view: bytes of the values.
+
+    Raises:
+        PickleError: the parts do not fit together, or text cannot be decoded.
+    """
     if math.prod(shape) * dtype.itemsize != len(view):
         raise PickleError(
-            f"holds {len(view)} bytes for an array of shape {shown(list(shape))} and type {dtype}; it is damaged or cut off"
+            f"has {len(view)} bytes for an array of shape {shown(list(shape))} and type {dtype}; it is damaged or cut off"
         )
     native = dtype.newbyteorder("=")
     if not len(view):
         try:
             return np.zeros(shape, native)
-        except ValueError:  # no number, but in too many rows
-            raise PickleError("holds an array without a proper shape; it is damaged") from None
-    if dtype.kind == "b":  # any byte may be there, and NumPy wants 0 or 1
+        except ValueError:  # no values, but too many rows
+            raise PickleError("has an array without a valid shape; it is damaged") from None
+    if dtype.kind == "b":  # the file may have any byte, and NumPy requires 0 or 1
         return (np.frombuffer(view, np.uint8) != 0).reshape(shape, order=order)
     array = np.frombuffer(view, dtype).astype(native)
     if dtype.kind == "U" and array.view(np.uint32).max() > 0x10FFFF:
-        raise PickleError("holds text that cannot be decoded; it is damaged")
+        raise PickleError("has text that cannot be decoded; it is damaged")
     return array.reshape(shape, order=order)
 
 
 def select(source: Any, chosen: Any, shape: Any) -> NDArray:
-    """Return chumpy's `source.ravel()[chosen].reshape(shape)`."""
+    """Return chumpy's selection `source.ravel()[chosen].reshape(shape)`.
+
+    Raises:
+        PickleError: the parts do not fit together.
+    """
     if not isinstance(source, np.ndarray) or not isinstance(chosen, np.ndarray) or chosen.dtype.kind not in "iu":
-        raise PickleError("holds a chumpy selection without an array or without numbers; it is damaged")
+        raise PickleError("has a chumpy selection without an array or without indices; it is damaged")
     shape = chosen.shape if shape is None else checked_shape(shape)
     if math.prod(shape) != chosen.size:
-        raise PickleError("holds a chumpy selection of another shape than it says; it is damaged")
+        raise PickleError("has a chumpy selection whose shape does not fit its indices; it is damaged")
     if not _are_within(chosen, source.size):
-        raise PickleError("holds a chumpy selection of what is not there; it is damaged")
+        raise PickleError("has a chumpy selection with indices out of range; it is damaged")
     return source.ravel()[chosen.astype(np.int64)].reshape(shape)
 
 
 def make_sparse(form: str, shape: Any, data: Any, index: Sequence[Any]) -> Any:
-    """Make scipy's sparse matrix of a form.
+    """Return a SciPy sparse matrix.
 
     Args:
         form: csc, csr or coo.
         shape: of the matrix.
-        data: its values.
-        index: for coo the rows and the columns, else the indices and where each column or row starts among them.
+        data: [K], its values.
+        index: for coo the rows [K] and the columns [K]; else the indices [K] and the start of each column or row among them.
+
+    Raises:
+        PickleError: the parts do not fit together.
     """
-    damaged = PickleError(f"holds a sparse matrix ({form}) whose parts do not fit together; it is damaged")
+    damaged = PickleError(f"has a sparse matrix ({form}) whose parts do not fit together; it is damaged")
     arrays = (data, *index)
     if not all(isinstance(array, np.ndarray) and array.ndim == 1 for array in arrays) or data.dtype.kind not in "fiub":
         raise damaged
@@ -89,7 +110,7 @@ def make_sparse(form: str, shape: Any, data: Any, index: Sequence[Any]) -> Any:
         raise damaged
     if not isinstance(shape, tuple) or len(shape) != 2 or any(type(n) is not int or not 0 <= n < 2**31 for n in shape):
         raise damaged
-    # SciPy's native code trusts these numbers.
+    # SciPy's native code does not check these numbers.
     if form == "coo":
         if any(len(part) != len(data) or not _are_within(part, size) for part, size in zip(index, shape, strict=True)):
             raise damaged

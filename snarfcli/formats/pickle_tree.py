@@ -1,4 +1,4 @@
-"""What the tree of a pickle is made of, besides plain values."""
+"""Nodes of the tree that `read_tree` makes of a pickle, besides plain values."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ __all__ = ["Call", "Name", "PickleError", "Raw", "shown"]
 
 
 class PickleError(ValueError):
-    """Why a pickle is not read, as the end of a sentence that begins with the file's name."""
+    """A pickle that cannot be read; the message is the end of a sentence that begins with the name of the file."""
 
 
 def shown(text: object) -> str:
-    """Make text from a file fit for a message: ASCII, one line, at most 60 characters."""
+    """Return text from a file in a form for messages: ASCII, one line, at most 60 characters."""
     line = ascii(str(text)[:200])[1:-1]
     return line if len(line) <= 60 else line[:57] + "..."
 
 
 class Name:
-    """A class or function that the pickle names, and what we take it for."""
+    """A class or function that the pickle names: its path, and its kind in `KNOWN_NAMES`."""
 
     __slots__ = ("kind", "path")
 
@@ -27,35 +27,35 @@ class Name:
 
 
 class Raw:
-    """Bytes or text as it lies in the file, not copied before it is asked for, and then once."""
+    """Bytes or text inside the file; copied once, when the value is first read."""
 
     __slots__ = ("_value", "encoding", "view")
 
     def __init__(self, view: memoryview, encoding: str | None) -> None:
         self.view = view
         self.encoding = encoding
-        """None for bytes; latin1 for the strings of Python 2, which may also be bytes."""
+        """None for bytes; latin1 for strings of Python 2, which may contain bytes."""
         self._value: str | bytes | None = None
 
     @property
     def value(self) -> str | bytes:
-        """The text, or the bytes if it is none; kept, so that it costs once, wherever the file refers to it."""
+        """The decoded text, or the bytes; kept, since the file may refer to it many times."""
         if self._value is None:
             self._value = self.decoded()
         return self._value
 
     def decoded(self) -> str | bytes:
-        """Return the text, or the bytes if it is none."""
+        """Return the decoded text, or the bytes if there is no encoding."""
         if self.encoding is None:
             return bytes(self.view)
         try:
             return str(self.view, self.encoding, "surrogatepass" if self.encoding == "utf-8" else "strict")
         except UnicodeDecodeError:
-            raise PickleError("holds text that cannot be decoded") from None
+            raise PickleError("has text that cannot be decoded") from None
 
 
 class Call:
-    """An object that the pickle wants made: by which name, of what, and the state and the items set afterwards."""
+    """An object that the pickle asks for: its name, arguments, and the state and items that are set afterwards."""
 
     __slots__ = ("args", "items", "name", "state")
 

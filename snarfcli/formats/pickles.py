@@ -1,57 +1,22 @@
-"""Pickles as plain data: SMPL's body files, AIST++'s motions, CAPE's lists. Nothing in a pickle is ever called."""
+"""Read pickles as plain data (SMPL's body files, AIST++'s motions, CAPE's lists) without executing them."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import scipy.sparse
-from numpy.typing import NDArray
-
 from snarfcli.errors import UserError
-from snarfcli.formats.pickle_numbers import SPARSE_FORMS, checked_shape, make_array, make_dtype, make_sparse, select
 from snarfcli.formats.pickle_opcodes import read_tree
-from snarfcli.formats.pickle_tree import Call, Name, PickleError, Raw, shown
+from snarfcli.formats.pickle_tree import PickleError
+from snarfcli.formats.pickle_values import KNOWN_NAMES, plain_data
 
 __all__ = ["read_pickle"]
 
-# SMPL-X, the largest of the files that people have, takes about half a GiB.
+# SMPL-X, the largest common file, takes about half a GiB.
 _MAX_FILE_BYTES = 2 << 30
-_MAX_DEPTH = 64
-_MAX_VALUES = 10_000_000
-# What may be made beyond the file: text as bytes as an array, then a selection of it, each as large as the file.
+# Memory beyond the file: text as bytes as an array, then a selection of it, each as large as the file.
 _BYTES_PER_FILE_BYTE = 4
 _BYTES_ALWAYS = 64 << 20
-
-_KNOWN = {
-    ("numpy", "ndarray"): "array type",
-    ("numpy", "matrix"): "array type",
-    ("numpy.matrixlib.defmatrix", "matrix"): "array type",
-    ("numpy", "dtype"): "dtype",
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): "array" for core in ("core", "_core")},
-    **{(f"numpy.{core}.multiarray", "scalar"): "scalar" for core in ("core", "_core")},
-    **{(f"numpy.{core}.numeric", "_frombuffer"): "array from bytes" for core in ("core", "_core")},
-    ("chumpy", "Ch"): "chumpy value",
-    ("chumpy.ch", "Ch"): "chumpy value",
-    ("chumpy.reordering", "Select"): "chumpy selection",
-    **{
-        (f"scipy.sparse{module.format(form)}", f"{form}_{suffix}"): form
-        for form in SPARSE_FORMS
-        for module in (".{}", "._{}", "")
-        for suffix in ("matrix", "array")
-    },
-    ("_codecs", "encode"): "bytes from text",
-    **{(module, "_reconstructor"): "object of" for module in ("copy_reg", "copyreg")},
-    **{
-        (module, name): kind
-        for module in ("__builtin__", "builtins")
-        for name, kind in {"object": "object", "set": "set", "frozenset": "set", "bytes": "bytes"}.items()
-    },
-    ("collections", "OrderedDict"): "dict",
-}
 
 
 def read_pickle(path: str | Path, what: str = "file") -> Any:
@@ -59,15 +24,16 @@ def read_pickle(path: str | Path, what: str = "file") -> Any:
 
     Args:
         path: the file.
-        what: what the file is to the user, for messages.
+        what: name of the kind of file, for messages.
 
     Returns:
-        dict, list, tuple, set, str, bytes, numbers, None, and numpy arrays that own their memory. The strings of Python 2 are
-        decoded as latin1. A chumpy object comes as the array of its value, a sparse matrix as scipy's of the same form, an
-        array of objects as the flat list of them.
+        dict, list, tuple, set, str, bytes, numbers, None, and NumPy arrays that own their memory. Strings of Python 2 are
+        decoded as latin1. A chumpy object becomes the array of its value, a sparse matrix that of SciPy in the same format, and
+        an array of objects the flat list of them.
 
     Raises:
-        UserError: the file is missing, is no pickle or is damaged, or wants any other class than plain data needs; it is named.
+        UserError: the file is missing, is not a pickle, is damaged, or contains a class that plain data does not need; the
+            message names the class.
     """
     path = Path(path)
     if path.is_dir():
@@ -75,7 +41,7 @@ def read_pickle(path: str | Path, what: str = "file") -> Any:
     if not path.exists():
         raise UserError(f"no {what} at {path}")
     if not path.is_file():
-        raise UserError(f"{what} {path} is no regular file; name a pickle file (.pkl)")
+        raise UserError(f"{what} {path} is not a regular file; name a pickle file (.pkl)")
     try:
         if path.stat().st_size > _MAX_FILE_BYTES:
             raise UserError(f"{what} {path} is larger than {_MAX_FILE_BYTES >> 30} GiB; models and motions are smaller")
@@ -83,222 +49,8 @@ def read_pickle(path: str | Path, what: str = "file") -> Any:
     except OSError as error:
         raise UserError(f"{what} {path} cannot be opened ({error.strerror or error})") from None
     try:
-        return _Reading(_BYTES_ALWAYS + _BYTES_PER_FILE_BYTE * len(data)).value(read_tree(data, _KNOWN), 0)
+        return plain_data(read_tree(data, KNOWN_NAMES), _BYTES_ALWAYS + _BYTES_PER_FILE_BYTE * len(data))
     except PickleError as error:
         raise UserError(f"{what} {path} {error}") from None
     except MemoryError:
-        raise UserError(f"{what} {path} needs more memory than there is") from None
-
-
-class _Reading:
-    """Turns the tree of a pickle into plain data; keeps count, so that a small file cannot become large."""
-
-    def __init__(self, budget: int) -> None:
-        self.budget = budget
-        self.count = 0
-        self.deepest = 0
-        # What each node became, how many values it holds and how deep it is; None while it is being read. Nodes are told apart
-        # by identity, which lasts, because the tree outlives the reading.
-        self.done: dict[int, tuple[Any, int, int] | None] = {}
-
-    def spend(self, count: int) -> None:
-        self.budget -= count
-        if self.budget < 0:
-            raise PickleError("becomes far larger when read than it is; it was made by no known program")
-
-    def value(self, node: Any, depth: int) -> Any:
-        self.count += 1
-        self.deepest = max(self.deepest, depth)
-        if node is None or isinstance(node, (bool, int, float, str, bytes)):
-            return node
-        if isinstance(node, Raw):
-            return node.value
-        if isinstance(node, Name):
-            raise PickleError(f"holds the class {shown(node.path)} itself, which no plain data needs")
-        if id(node) in self.done:
-            seen = self.done[id(node)]
-            if seen is None:
-                raise PickleError("holds a list or object that contains itself, which no plain data needs")
-            result, count, height = seen
-            self.count += count
-            self.deepest = max(self.deepest, depth + height)
-        if self.count > _MAX_VALUES or self.deepest > _MAX_DEPTH:
-            limit = f"{_MAX_VALUES:,} values" if self.count > _MAX_VALUES else f"{_MAX_DEPTH} levels"
-            raise PickleError(f"holds more than {limit}; models and motions store arrays")
-        if id(node) in self.done:
-            return result
-        count, deepest = self.count, self.deepest
-        self.done[id(node)], self.deepest = None, depth
-        result = self.container(node, depth + 1)
-        self.done[id(node)] = result, self.count - count, self.deepest - depth
-        self.deepest = max(self.deepest, deepest)
-        return result
-
-    def container(self, node: Any, depth: int) -> Any:
-        if isinstance(node, Call):
-            return self.call(node, depth)
-        if isinstance(node, dict):
-            return {key: self.value(item, depth) for key, item in node.items()}
-        if isinstance(node, (set, frozenset)):
-            return set(node)
-        return type(node)(self.value(item, depth) for item in node)  # list or tuple
-
-    def call(self, call: Call, depth: int) -> Any:
-        name, args, state = call.name, call.args, call.state
-        if name.kind == "object of":  # protocols 0 and 1: (class, object, None) makes an empty instance
-            if len(args) != 3 or not isinstance(args[0], Name) or _kind(args[1]) != "object" or args[2] is not None:
-                raise _odd(name)
-            name, args = args[0], ()
-        if call.items and name.kind != "dict":
-            raise _odd(name)
-        make = _MAKERS.get(name.kind)
-        if make is None:
-            raise _odd(name)
-        return make(self, name, args, state, call, depth)
-
-    # One method for each kind of object.
-
-    def make_array(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
-        if len(args) != 3 or _kind(args[0]) != "array type" or not isinstance(state, tuple) or len(state) not in (4, 5):
-            raise _odd(name)
-        shape, dtype, is_fortran, data = state[-4:]
-        return self.array(name, shape, dtype, "F" if is_fortran is True or is_fortran == 1 else "C", data, depth)
-
-    def make_array_from_bytes(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
-        if len(args) != 4 or state is not None:
-            raise _odd(name)
-        data, dtype, shape, order = args
-        order = self.value(order, depth)
-        if order not in ("C", "F", None):
-            raise _odd(name)
-        return self.array(name, shape, dtype, order or "C", data, depth)
-
-    def make_scalar(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
-        if len(args) != 2 or state is not None:
-            raise _odd(name)
-        value = self.array(name, (), args[0], "C", args[1], depth)
-        if not isinstance(value, np.ndarray):
-            raise _odd(name)
-        return value.item()
-
-    def array(self, name: Name, shape: Any, dtype: Any, order: str, data: Any, depth: int) -> NDArray | list:
-        shape, dtype = checked_shape(shape), self.dtype(dtype)
-        if dtype.kind == "O":
-            if not isinstance(data, list) or len(data) != math.prod(shape):
-                raise PickleError(f"holds an array of shape {shown(list(shape))} with another number of objects; it is damaged")
-            return [self.value(item, depth) for item in data]
-        view = self.bytes(name, data, depth)
-        self.spend(len(view))
-        return make_array(shape, dtype, order, view)
-
-    def dtype(self, node: Any) -> np.dtype:
-        if _kind(node) != "dtype" or not isinstance(node, Call) or not node.args:
-            raise PickleError("holds an array without a type; it is damaged")
-        order = None
-        if node.state is not None:  # (version, byte order, base of a subarray, names, fields, ...)
-            if not isinstance(node.state, tuple) or len(node.state) < 5 or any(part is not None for part in node.state[2:5]):
-                raise PickleError("holds an array of records, wanted numbers or text")
-            order = _text(node.state[1])
-        return make_dtype(_text(node.args[0]), order)
-
-    def bytes(self, name: Name, node: Any, depth: int) -> memoryview:
-        if isinstance(node, Raw) and node.encoding != "utf-8":
-            return node.view
-        value = node if isinstance(node, str) else self.value(node, depth)
-        if isinstance(value, str):
-            value = self.encoded(value)
-        if not isinstance(value, bytes):
-            raise _odd(name)
-        return memoryview(value)
-
-    def encoded(self, text: str) -> bytes:
-        self.spend(len(text))
-        try:
-            return text.encode("latin1")
-        except UnicodeEncodeError:
-            raise PickleError("holds text where bytes belong; it is damaged") from None
-
-    def make_bytes_from_text(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> bytes:
-        if len(args) != 2 or state is not None or _text(args[1]) not in ("latin1", "latin-1"):
-            raise _odd(name)
-        text = args[0].decoded() if isinstance(args[0], Raw) else args[0]  # not kept: it may be most of the file
-        if not isinstance(text, str):
-            raise _odd(name)
-        return self.encoded(text)
-
-    def make_bytes(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> bytes:
-        if args or state is not None:
-            raise _odd(name)
-        return b""
-
-    def make_set(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> set:
-        values = self.value(args[0], depth) if len(args) == 1 else () if not args else None
-        if not isinstance(values, (list, tuple)) or state is not None:
-            raise _odd(name)
-        return self.keyed(name, [(value, None) for value in values]).keys() | set()
-
-    def make_dict(self, name: Name, args: tuple, state: Any, call: Call, depth: int) -> dict:
-        pairs = self.value(args[0], depth) if len(args) == 1 else [] if not args else None
-        if not isinstance(pairs, list) or state or any(not isinstance(pair, (list, tuple)) or len(pair) != 2 for pair in pairs):
-            raise _odd(name)
-        return {**self.keyed(name, pairs), **{key: self.value(item, depth) for key, item in call.items.items()}}
-
-    def keyed(self, name: Name, pairs: list) -> dict:
-        if any(key is not None and not isinstance(key, (str, int, float, bytes)) for key, _ in pairs):
-            raise _odd(name)
-        return dict(pairs)
-
-    def make_chumpy_value(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
-        if not isinstance(state, dict) or "x" not in state:
-            raise _odd(name)
-        value = self.value(state["x"], depth)
-        if isinstance(value, (bool, int, float)):
-            return np.array(value)
-        if not isinstance(value, np.ndarray) and not scipy.sparse.issparse(value):
-            raise _odd(name)
-        return value
-
-    def make_chumpy_selection(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> NDArray:
-        if not isinstance(state, dict):
-            raise _odd(name)
-        source, chosen, shape = (self.value(state.get(key), depth) for key in ("a", "idxs", "preferred_shape"))
-        if isinstance(source, np.ndarray) and isinstance(chosen, np.ndarray):
-            self.spend(chosen.size * (source.itemsize + 8) + (0 if source.flags.c_contiguous else source.nbytes))
-        return select(source, chosen, shape)
-
-    def make_sparse(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
-        if not isinstance(state, dict):
-            raise _odd(name)
-        keys = ("row", "col") if name.kind == "coo" else ("indices", "indptr")
-        shape, data, coords, *index = (self.value(state.get(key), depth) for key in ("_shape", "data", "coords", *keys))
-        index = coords if name.kind == "coo" and isinstance(coords, tuple) else index
-        self.spend(sum(2 * part.nbytes + 8 * part.size for part in (data, *index) if isinstance(part, np.ndarray)))
-        return make_sparse(name.kind, shape, data, index)
-
-
-def _kind(node: Any) -> str | None:
-    if isinstance(node, Call):
-        node = node.name
-    return node.kind if isinstance(node, Name) else None
-
-
-def _text(node: Any) -> Any:
-    return node.value if isinstance(node, Raw) else node
-
-
-def _odd(name: Name) -> PickleError:
-    return PickleError(f"holds a {shown(name.path)} in a form that is not known; it is damaged or made by another program")
-
-
-_MAKERS: dict[str, Callable[..., Any]] = {
-    "array": _Reading.make_array,
-    "array from bytes": _Reading.make_array_from_bytes,
-    "scalar": _Reading.make_scalar,
-    "chumpy value": _Reading.make_chumpy_value,
-    "chumpy selection": _Reading.make_chumpy_selection,
-    **dict.fromkeys(SPARSE_FORMS, _Reading.make_sparse),
-    "bytes from text": _Reading.make_bytes_from_text,
-    "bytes": _Reading.make_bytes,
-    "set": _Reading.make_set,
-    "dict": _Reading.make_dict,
-}
+        raise UserError(f"{what} {path} needs more memory than is available; close other programs") from None

@@ -232,7 +232,7 @@ def test_missing_and_foreign_files(tmp_path):
     with pytest.raises(UserError, match=r"is neither an .npz nor a .pkl file"):
         load_body(tmp_path / "body.obj")
     (tmp_path / "evil.pkl").write_bytes(pickled(octahedron()).replace(b"cchumpy.ch\nCh\n", b"cposix\nsystem\n"))
-    with pytest.raises(UserError, match=r"asks for posix.system, which no plain data needs"):
+    with pytest.raises(UserError, match=r"asks for posix.system, which plain data does not need"):
         load_body(tmp_path / "evil.pkl")
     with pytest.raises(ValueError, match="num_betas: wanted at least 0"):
         load_body(tmp_path / "evil.pkl", num_betas=-1)

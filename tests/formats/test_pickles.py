@@ -7,7 +7,6 @@ import pickle
 import random
 import re
 import struct
-import time
 import tracemalloc
 from collections import OrderedDict, defaultdict
 from decimal import Decimal
@@ -152,7 +151,7 @@ def test_names_found_through_others_are_refused(tmp_path):
     assert r"asks for os\n\x1b[2.\u2603" in message
 
 
-# --- what is aimed at the reader itself ---------------------------------------------------------------------------------------
+# --- attacks on the reader ----------------------------------------------------------------------------------------------------
 
 ARRAY = b"cnumpy.core.multiarray\n_reconstruct\n(cnumpy\nndarray\nK\x00\x85U\x01btR"
 F8 = b"cnumpy\ndtype\nU\x02f8K\x00K\x01\x87R(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
@@ -187,9 +186,9 @@ CASES = {
     "build twice": (b"cchumpy.ch\nCh\n)\x81}b}b.", "damaged"),
     "call of a list": (b"])R.", "damaged"),
     "keywords": (b"\x80\x04ccollections\nOrderedDict\n)}K\x01K\x02s\x92.", "keyword"),
-    "class as value": (b"cnumpy\nndarray\n.", "class numpy.ndarray itself"),
-    "no state": (b"cchumpy.ch\nCh\n)\x81.", "form that is not known"),
-    "items on chumpy": (b"cchumpy.ch\nCh\n)\x81K\x01K\x02s}U\x01xK\x01sb.", "form that is not known"),
+    "class as value": (b"cnumpy\nndarray\n.", "class numpy.ndarray as a value"),
+    "no state": (b"cchumpy.ch\nCh\n)\x81.", "unknown form"),
+    "items on chumpy": (b"cchumpy.ch\nCh\n)\x81K\x01K\x02s}U\x01xK\x01sb.", "unknown form"),
     "list in itself": (b"]q\x00h\x00a.", "contains itself"),
     "dict in itself": (b"}q\x00K\x01h\x00s.", "contains itself"),
     "chumpy in itself": (b"cchumpy.ch\nCh\n)\x81q\x00}U\x01xh\x00sb.", "contains itself"),
@@ -201,17 +200,17 @@ CASES = {
     "nested chumpy": (b"cchumpy.ch\nCh\n)\x81}U\x01x" * 5000 + b"K\x01" + b"sb" * 5000 + b".", "64 levels"),
     "doubling lists": (b"]q\x00" + b"0](h\x00h\x00eq\x00" * 60 + b".", "10,000,000 values"),
     "many steps": (b"N0" * 300_000 + b"N.", "500,000 steps"),
-    "negative size": (array(b"J\xff\xff\xff\xff\x85"), "proper shape"),
-    "size as text": (array(b"U\x012\x85"), "proper shape"),
+    "negative size": (array(b"J\xff\xff\xff\xff\x85"), "valid shape"),
+    "size as text": (array(b"U\x012\x85"), "valid shape"),
     "huge array": (array(b"J\xff\xff\xff\x7f\x85"), "16 bytes for an array of shape [2147483647]"),
-    "huge empty array": (array(b"K\x00\x8a\x05\0\0\0\0\x10\x8a\x05\0\0\0\0\x10\x87", data=b"U\x00"), "proper shape"),
-    "many dimensions": (array(b"(" + b"K\x01" * 40 + b"t"), "proper shape"),
+    "huge empty array": (array(b"K\x00\x8a\x05\0\0\0\0\x10\x8a\x05\0\0\0\0\x10\x87", data=b"U\x00"), "valid shape"),
+    "many dimensions": (array(b"(" + b"K\x01" * 40 + b"t"), "valid shape"),
     "records": (array(b"K\x02\x85", F8.replace(b"NNN", b"N)N")), "records"),
-    "void": (array(b"K\x02\x85", F8.replace(b"f8", b"V8")), "type V8, wanted numbers"),
+    "void": (array(b"K\x02\x85", F8.replace(b"f8", b"V8")), "wanted numbers or text, got V8"),
     "long type": (array(b"K\x02\x85", F8.replace(b"U\x02f8", b"X" + struct.pack("<I", 10**6) + b"f8" * 500_000)), "f8f8"),
     "wide text": (array(b"K\x01\x85", F8.replace(b"U\x02f8", b"U\x09U99999999")), "wanted numbers or text"),
     "no text": (array(b"K\x01\x85", F8.replace(b"f8", b"U4"), b"U\x10" + b"\xff" * 16), "cannot be decoded"),
-    "no bytes": (array(b"K\x02\x85", data=b"K\x01"), "form that is not known"),
+    "no bytes": (array(b"K\x02\x85", data=b"K\x01"), "unknown form"),
     "objects": (array(b"K\x09\x85", F8.replace(b"f8", b"O8"), b"](K\x01K\x02e"), "another number of objects"),
     "objects in bytes": (array(b"K\x02\x85", F8.replace(b"f8", b"O8")), "another number of objects"),
 }  # fmt: skip
@@ -221,12 +220,12 @@ CASES = {
 def test_bombs_end_in_one_line(case, tmp_path):
     data, message = CASES[case]
     tracemalloc.start()
-    start = time.perf_counter()
-    assert message in refusal(data, tmp_path)
-    seconds, peak = time.perf_counter() - start, tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    # Not a measure of speed: a hang would take minutes. Half a million steps under tracemalloc take some seconds.
-    assert seconds < 30
+    try:
+        error = refusal(data, tmp_path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert message in error
     assert peak < 2**29
 
 
@@ -287,8 +286,10 @@ def test_random_steps_are_read_or_refused(tmp_path):
     codes = b"(.0125BCFIJKLMNPQRSTUVX]abcdeghijlopqrstu}G)" + bytes(range(0x80, 0x99))
     for _ in range(3000):
         body = bytes(rng.choice(codes) if rng.random() < 0.8 else rng.randrange(256) for _ in range(rng.randint(1, 60)))
+        message = "model.pkl"
         try:
             read(body + b".", tmp_path)
         except UserError as error:
-            assert "model.pkl" in str(error)
-            assert str(error).isprintable()
+            message = str(error)
+        assert "model.pkl" in message
+        assert message.isprintable()

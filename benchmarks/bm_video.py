@@ -21,6 +21,7 @@ from snarfcli.rendering.animation import Animation
 from snarfcli.rendering.floor import Backdrop, Ground
 from snarfcli.rendering.lighting import Look, Solid
 from snarfcli.rendering.panels import Screen
+from snarfcli.rendering.pictures import make_pictures
 from snarfcli.rendering.stage import body_points, set_stage
 from snarfcli.rendering.views import parse_views
 
@@ -78,7 +79,7 @@ def _videos(options, avatar, motion) -> None:
         )  # fmt: skip
         start = time.perf_counter()
         with tempfile.TemporaryDirectory() as folder:
-            pictures = animation.pictures(processes, max(1, cores // processes))
+            pictures = make_pictures(animation, processes, max(1, cores // processes))
             write_video(Path(folder) / "video.mp4", pictures, motion.frame_rate)
         took = time.perf_counter() - start
         extraction, rendering = (sum(getattr(f, name) for f in animation.frames) for name in ("extraction_s", "rendering_s"))

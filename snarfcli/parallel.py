@@ -1,7 +1,7 @@
-"""Work on several processes, each task in a fresh one.
+"""Work on several processes: how many, one worker process, and tasks that each run in a fresh one.
 
 DESIGN. MeshLab's random state cannot be set, but it is the same at every start: a fresh process for each task makes the
-samples a function of the task alone, whatever the number of workers. Starting one takes about 0.4 s, so tasks should last
+samples a function of the task alone, for any number of workers. Starting one takes about 0.4 s, so tasks should last
 seconds. Processes are spawned, not forked (threads, Windows), and send their results item by item through a pipe.
 """
 
@@ -12,76 +12,156 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Callable, Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any
 
 from snarfcli.errors import UserError
 
-__all__ = ["Worker", "count_cores", "interrupts_held_back", "run_in_processes"]
+__all__ = [
+    "Worker",
+    "choose_processes",
+    "count_cores",
+    "end_workers",
+    "interrupts_held_back",
+    "parse_processes",
+    "run_in_processes",
+]
 
-_PATIENCE_S = 10.0  # for a process that was told to end; writing a large mesh takes a second
+_PATIENCE_S = 10.0  # between SIGTERM and SIGKILL; writing a large mesh takes a second
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
+_MOST_PROCESSES = 64
 
 
 def count_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-class Worker:
-    """A fresh single-threaded process that runs a generator function and sends what it yields, item by item.
+def parse_processes(text: str) -> int | None:
+    """Return the number of processes in a setting, None for auto.
 
-    It pays no heed to Ctrl-C, which reaches the whole group: whoever started it ends it. When it gets ahead of the one who
-    receives, it waits as soon as the pipe is full (64 kB on Linux).
+    Raises:
+        UserError: it is neither auto nor a number in range.
+    """
+    word = str(text).strip().lower()
+    if word == "auto":
+        return None
+    if not (word.isdecimal() and 1 <= int(word) <= _MOST_PROCESSES):
+        raise UserError(f"processes: wanted auto or a number from 1 to {_MOST_PROCESSES}, got '{text}'")
+    return int(word)
+
+
+def choose_processes(tasks: int, bytes_each: int, least_tasks: int = 1) -> int:
+    """Return the number of processes to use: one per core, as far as free memory and tasks allow.
+
+    Args:
+        tasks: number of tasks.
+        bytes_each: memory of one process, bytes.
+        least_tasks: minimum number of tasks that is worth the start of a process.
+    """
+    return max(1, min(count_cores(), _free_bytes() // bytes_each, tasks // least_tasks, _MOST_PROCESSES))
+
+
+def _free_bytes() -> int:
+    """Return the available memory, bytes; a very large number where the system does not report it."""
+    facts = Path("/proc/meminfo")
+    if facts.is_file():
+        for line in facts.read_text(errors="replace").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    return 2**50
+
+
+class Worker:
+    """A fresh single-threaded process that runs a generator function and sends each item that it yields.
+
+    The process ignores SIGINT, which Ctrl-C sends to the whole group; the parent process ends it. When it is ahead of the
+    receiver, it waits as soon as the pipe is full (64 kB on Linux).
     """
 
-    def __init__(self, function: Callable[..., Iterable[Any]], task: tuple[Any, ...], fewer: str = "workers=1") -> None:
-        """Start `function(*task)`; hold interrupts back meanwhile, and until the worker is where it will be ended from.
+    def __init__(
+        self,
+        function: Callable[..., Iterable[Any]],
+        task: tuple[Any, ...],
+        fewer: str = "workers=1",
+        *,
+        has_requests: bool = False,
+    ) -> None:
+        """Start `function(*task)`; wrap it and the line that stores the worker in `interrupts_held_back`.
 
         Args:
             function: a module-level generator function; its items must be picklable.
             task: its arguments, picklable.
-            fewer: how the user asks for fewer workers.
+            fewer: the setting that asks for fewer workers, for the message when memory runs out.
+            has_requests: whether the function gets one more argument, an iterator over what is passed to `send`.
         """
         context = multiprocessing.get_context("spawn")
-        self.receiver, sender = context.Pipe(duplex=False)
+        self.connection, theirs = context.Pipe(duplex=has_requests)
         work = pickle.dumps((function, task))  # here, so that a failure to read it there is reported like any other
-        self._process = context.Process(target=_serve, args=(sender, work), daemon=True)
+        self._process = context.Process(target=_serve, args=(theirs, work, has_requests), daemon=True)
         self._fewer = fewer
         with _one_thread():
             self._process.start()
-        sender.close()
+        theirs.close()
+
+    def send(self, request: Any) -> None:
+        """Send a request to a function that takes requests.
+
+        Raises:
+            UserError: the process has ended early, for example because the system killed it when memory ran out.
+            Exception: the exception that the function raised.
+        """
+        try:
+            self.connection.send(request)
+        except OSError:
+            while self.receive()[0]:  # raises the reason if there is one
+                pass
+            raise self._lost() from None
 
     def receive(self) -> tuple[bool, Any]:
         """Wait for the next item and return (True, item), or (False, None) after the last one.
 
         Raises:
-            UserError: the process ended without a word, as when the system kills it for want of memory.
-            Exception: whatever the function raised.
+            UserError: the process has ended early, for example because the system killed it when memory ran out.
+            Exception: the exception that the function raised.
         """
         try:
-            kind, item = self.receiver.recv()
+            kind, item = self.connection.recv()
         except (EOFError, OSError):  # before a message, or in the middle of one
-            self._process.join()
-            raise UserError(
-                f"a worker process ended early (exit code {self._process.exitcode}); "
-                f"if memory ran out, try again with fewer workers, for example {self._fewer}"
-            ) from None
+            raise self._lost() from None
         if kind == "error":
             raise item
         return kind == "item", item
 
     def end(self) -> None:
-        """End the process, whatever it is doing; nothing is left of it afterwards."""
-        self.receiver.close()  # first: a process that waits for somebody to receive goes on then, to its end
+        """End the process, also in the middle of its work, and wait until it has ended."""
+        self.connection.close()  # first: a process that waits in the pipe goes on then, and ends
         self._process.terminate()
         self._process.join(_PATIENCE_S)
-        if self._process.is_alive():  # Python heard the signal where it passes over exceptions, or hangs in native code
+        if self._process.is_alive():  # Python received the signal where it ignores exceptions, or hangs in native code
             self._process.kill()
             self._process.join()
+
+    def _lost(self) -> UserError:
+        self._process.join()
+        return UserError(
+            f"a worker process ended early (exit code {self._process.exitcode}); "
+            f"if memory ran out, try again with fewer workers, for example {self._fewer}"
+        )
+
+
+def end_workers(workers: Sequence[Worker]) -> None:
+    """End several workers at the same time: each ends only when it leaves native code."""
+    threads = [threading.Thread(target=worker.end) for worker in workers]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
 
 
 def run_in_processes(
@@ -92,17 +172,17 @@ def run_in_processes(
     Args:
         function: a module-level generator function; its items and the tasks must be picklable.
         tasks: argument tuples, drawn one at a time when a process is free.
-        workers: how many processes run at a time.
+        workers: number of processes at a time.
 
     Yields:
-        (number of the task, item): the items of one task in order, the tasks interleaved.
+        (number of the task, item): the items of a task in order, those of different tasks interleaved.
 
     Raises:
-        UserError: a process ended without a result, as when the system kills it for want of memory.
-        Exception: whatever `function` raised. All processes have ended when this, a KeyboardInterrupt or anything else
-            leaves here.
+        UserError: a process ended early, for example because the system killed it when memory ran out.
+        Exception: an exception of `function`. All processes have ended when any exception leaves this function,
+            KeyboardInterrupt included.
     """
-    running: dict[Connection, tuple[int, Worker]] = {}
+    running: dict[Any, tuple[int, Worker]] = {}  # by connection
     numbered = enumerate(tasks)
     exhausted = False
     try:
@@ -114,46 +194,56 @@ def run_in_processes(
                     break
                 with interrupts_held_back():
                     worker = Worker(function, task)
-                    running[worker.receiver] = number, worker
+                    running[worker.connection] = number, worker
             if not running:
                 return
-            for receiver in wait(list(running)):
-                number, worker = running[receiver]
+            for connection in wait(list(running)):
+                number, worker = running[connection]
                 has_item, item = worker.receive()
                 if has_item:
                     yield number, item
                 else:
                     worker.end()
-                    del running[receiver]
+                    del running[connection]
     finally:
         for _, worker in running.values():
             worker.end()
 
 
-def _serve(sender: Connection, work: bytes) -> None:
-    """Run one task in the worker and send each item; the parent alone decides what a failure means."""
+def _serve(connection: Connection, work: bytes, has_requests: bool) -> None:
+    """Run one task in the worker and send each item; the parent decides what a failure means."""
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends the workers
     try:
         function, task = pickle.loads(work)
-        for item in function(*task):
-            sender.send(("item", item))
-        sender.send(("done", None))
-    except BrokenPipeError:
-        pass  # the parent is gone, so nobody waits for the rest
+        for item in function(*task, *([_requests(connection)] if has_requests else [])):
+            connection.send(("item", item))
+        connection.send(("done", None))
+    except (BrokenPipeError, ConnectionResetError):
+        pass  # the parent has closed the connection: the rest is not needed
     except Exception as error:
-        with contextlib.suppress(BrokenPipeError):
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             try:
-                sender.send(("error", error))
+                connection.send(("error", error))
             except (TypeError, AttributeError, pickle.PicklingError):
-                sender.send(("error", RuntimeError(f"{type(error).__name__}: {error}")))
+                connection.send(("error", RuntimeError(f"{type(error).__name__}: {error}")))
     finally:
-        sender.close()
+        connection.close()
+
+
+def _requests(connection: Connection) -> Iterator[Any]:
+    """Yield what the parent sends until it closes the connection."""
+    while True:
+        try:
+            request = connection.recv()
+        except (EOFError, ConnectionResetError):
+            return
+        yield request
 
 
 @contextlib.contextmanager
 def interrupts_held_back() -> Iterator[None]:
-    """Let a process start with Ctrl-C blocked, so that an early one prints no trace; ours arrives when this ends."""
+    """Start processes with SIGINT blocked, so that an early Ctrl-C prints no stack trace; this process gets it afterwards."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -166,7 +256,7 @@ def interrupts_held_back() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Let a process start with one thread for every numerical library; several processes share the cores already."""
+    """Start processes whose numerical libraries use one thread each; several processes share the cores already."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:

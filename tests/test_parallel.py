@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from snarfcli.errors import UserError
-from snarfcli.parallel import Worker, run_in_processes
+from snarfcli.parallel import Worker, choose_processes, count_cores, end_workers, parse_processes, run_in_processes
 
 
 def _count(start: int, stop: int) -> Iterator[tuple[int, int]]:
@@ -32,6 +32,13 @@ def _fail(kind: str) -> Iterator[int]:
 def _forever() -> Iterator[int]:
     while True:
         yield 0
+
+
+def _answer(factor: int, requests: Iterator[int]) -> Iterator[int]:
+    for request in requests:
+        if request < 0:
+            raise UserError("negative")
+        yield factor * request
 
 
 def _deaf() -> Iterator[bytes]:
@@ -98,3 +105,47 @@ def test_leaving_early_ends_the_workers_and_draws_no_more_tasks() -> None:
     results.close()
     assert not multiprocessing.active_children()
     assert drawn == [0]
+
+
+def test_requests_are_answered_in_order_until_one_fails() -> None:
+    worker = Worker(_answer, (3,), has_requests=True)
+    for request in (1, 2):
+        worker.send(request)
+        assert worker.receive() == (True, 3 * request)
+    worker.send(-1)
+    with pytest.raises(UserError, match="negative"):
+        worker.receive()
+    worker.end()
+    assert not multiprocessing.active_children()
+
+
+def test_a_request_to_a_process_that_was_killed_is_reported() -> None:
+    worker = Worker(_answer, (3,), "processes=2", has_requests=True)
+    worker.send(1)
+    assert worker.receive() == (True, 3)
+    assert worker._process.pid is not None
+    os.kill(worker._process.pid, signal.SIGKILL)
+    worker._process.join()
+    with pytest.raises(UserError, match=r"ended early \(exit code -9\).*fewer workers, for example processes=2"):
+        worker.send(2)
+    end_workers([worker])
+    assert not multiprocessing.active_children()
+
+
+def test_a_request_to_a_function_that_could_not_start_tells_why() -> None:
+    worker = Worker(_answer, (_Unreadable(),), has_requests=True)
+    worker._process.join()
+    with pytest.raises(UserError, match="cannot be read there"):
+        worker.send(2)
+    worker.end()
+
+
+def test_number_of_processes() -> None:
+    assert parse_processes("auto") is None
+    assert parse_processes("3") == 3
+    for text in ("0", "-1", "many", "65", "1.5"):
+        with pytest.raises(UserError, match="processes: wanted auto or a number from 1 to 64, got"):
+            parse_processes(text)
+    assert choose_processes(1000, 1) == min(count_cores(), 64)
+    assert choose_processes(5, 1, least_tasks=6) == 1
+    assert choose_processes(1000, 2**60) == 1

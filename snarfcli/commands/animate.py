@@ -31,10 +31,10 @@ from snarfcli.meshing.mesh_files import MESH_WRITERS
 from snarfcli.meshing.posed import SURFACES
 from snarfcli.meshing.surfaces import canonical_surface
 from snarfcli.motions import Motion
-from snarfcli.parallel import count_cores
-from snarfcli.rendering.animation import CONTENTS, Animation, Meshes, place_canonical
+from snarfcli.parallel import count_cores, parse_processes
+from snarfcli.rendering.animation import CONTENTS, Animation, GroundTruthMeshes, place_canonical
 from snarfcli.rendering.panels import Screen, picture_size
-from snarfcli.rendering.processes import choose_processes, parse_processes
+from snarfcli.rendering.pictures import frame_processes, make_pictures
 from snarfcli.rendering.sheet import write_png
 from snarfcli.rendering.stage import CAMERAS, body_points, set_stage
 from snarfcli.rendering.video import write_video
@@ -66,7 +66,7 @@ def run(config: AnimateConfig) -> int:
     motion, count = chosen.motion, len(chosen.numbers)
     truth = true_meshes(config, config, avatar, chosen, config.pose) if config.video and "truth" in config.beside else None
     on_cpu = avatar.device.type == "cpu"
-    processes = choose_processes(plan.processes, count, config.resolution, extract=on_cpu, draw=config.video)
+    processes = frame_processes(plan.processes, count, config.resolution, extract=on_cpu, draw=config.video)
     folder = Path(config.output) if config.output else path.parent / "animation" / folder_name(motion.name)
     settings = frame_settings(config, path, chosen)
     prepare_folder(folder, settings, config.overwrite)
@@ -95,7 +95,7 @@ def run(config: AnimateConfig) -> int:
     threads = max(1, (config.threads or count_cores()) // processes)
     if processes > 1:
         log.info("%d processes %s", processes, f"of {threads} threads" if on_cpu else "draw")
-    pictures = animation.pictures(processes, threads, extracts_here=not on_cpu)
+    pictures = make_pictures(animation, processes, threads, extracts_here=not on_cpu)
     try:
         if config.video:
             write_video(folder / VIDEO, _with_poster(pictures, count // 2, folder / POSTER), motion.frame_rate)
@@ -148,7 +148,12 @@ def _check(config: AnimateConfig) -> _Plan:
 
 
 def _screen(
-    config: AnimateConfig, plan: _Plan, avatar: Avatar, chosen: ChosenMotion, canonical: Mesh | None, truth: Meshes | None
+    config: AnimateConfig,
+    plan: _Plan,
+    avatar: Avatar,
+    chosen: ChosenMotion,
+    canonical: Mesh | None,
+    truth: GroundTruthMeshes | None,
 ) -> Screen:
     """Set the stage for a motion."""
     motion = chosen.motion

@@ -17,6 +17,7 @@ from omegaconf import MISSING
 import snarfcli
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import one_line
+from snarfcli.parallel import count_cores
 
 __all__ = ["DoctorConfig", "Finding", "run"]
 
@@ -161,8 +162,7 @@ def _processor() -> Iterator[Finding]:
     from snarfcli.runs import machine_facts
 
     machine = machine_facts()["machine"]
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else machine["cores"]
-    yield Finding("model", f"{machine['processor']}, {machine['cores']} cores, {usable} of them usable here")
+    yield Finding("model", f"{machine['processor']}, {machine['cores']} cores, {count_cores()} of them usable here")
     limit = os.environ.get("OMP_NUM_THREADS")
     yield Finding("threads", f"{machine['threads']} (PyTorch's number{f'; OMP_NUM_THREADS={limit}' if limit else ''})")
     yield _native()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -15,6 +14,9 @@ from omegaconf import MISSING
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.train import TrainConfig
 from snarfcli.errors import UserError
+from snarfcli.hydra_config.overrides import check_overrides
+from snarfcli.hydra_config.schema import config_folder, preset_groups, register_schemas
+from snarfcli.parallel import count_cores
 from snarfcli.reproduce.jobs import Status, read_status
 from snarfcli.reproduce.launching import LAUNCHERS, Launcher, check_launcher, launch
 from snarfcli.reproduce.plans import Choice, Job, Plan, choose_experiments, make_plan, unique_jobs
@@ -22,7 +24,6 @@ from snarfcli.reproduce.report import write_report
 from snarfcli.reproduce.results import Result, collect
 from snarfcli.reproduce.tables import plain_table
 from snarfcli.runs import choose_device
-from snarfcli.settings import check_overrides, config_folder, preset_groups, register_schemas
 
 __all__ = ["ReproduceConfig", "resolve_training", "run"]
 
@@ -167,15 +168,11 @@ def _check(config: ReproduceConfig) -> Launcher:
         choose_device(config.device)
     threads = config.threads
     if threads is None and config.launcher in ("joblib", "submitit_local"):
-        threads = max(1, _cores() // config.processes)
+        threads = max(1, count_cores() // config.processes)
     launcher = Launcher(config.launcher, config.processes, threads, tuple(config.launcher_settings))
     if not (config.dry_run or config.only_report):
         check_launcher(launcher)
     return launcher
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _report_folder(config: ReproduceConfig, plan: Plan) -> Path:

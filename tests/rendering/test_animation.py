@@ -11,9 +11,8 @@ from moody_avatar import MoodyAvatar
 
 from snarfcli.errors import UserError
 from snarfcli.rendering.animation import Animation
-from snarfcli.rendering.drawers import Drawer
 from snarfcli.rendering.panels import Screen
-from snarfcli.rendering.processes import choose_processes, parse_processes
+from snarfcli.rendering.pictures import frame_processes, make_pictures
 from snarfcli.rendering.stage import body_points, set_stage
 from snarfcli.rendering.views import parse_views
 
@@ -33,9 +32,9 @@ def animation(folder: Path) -> Animation:
 
 def test_several_processes_make_the_same_frames_and_a_lost_one_is_reported(tmp_path):
     alone, together = animation(tmp_path / "alone"), animation(tmp_path / "together")
-    pictures = alone.pictures()
+    pictures = make_pictures(alone)
     wanted = [next(pictures) for _ in range(5)]
-    made = together.pictures(processes=2)
+    made = make_pictures(together, processes=2)
     for picture in wanted:
         np.testing.assert_array_equal(next(made), picture)
     assert [(frame.frame, frame.file, frame.vertices) for frame in together.frames] == [
@@ -54,7 +53,7 @@ def test_several_processes_make_the_same_frames_and_a_lost_one_is_reported(tmp_p
 
 def test_surfaces_made_here_are_drawn_elsewhere(tmp_path):
     alone, together = animation(tmp_path / "alone"), animation(tmp_path / "together")
-    pictures, made = alone.pictures(), together.pictures(processes=2, extracts_here=True)
+    pictures, made = make_pictures(alone), make_pictures(together, processes=2, extracts_here=True)
     for _ in range(3):  # the third has no surface
         np.testing.assert_array_equal(next(made), next(pictures))
     assert [frame.vertices for frame in together.frames] == [frame.vertices for frame in alone.frames]
@@ -63,30 +62,18 @@ def test_surfaces_made_here_are_drawn_elsewhere(tmp_path):
     assert not multiprocessing.active_children()
 
 
-def test_a_drawer_that_is_lost_or_fails_is_reported(tmp_path):
-    screen = animation(tmp_path).screen
-    drawer = Drawer(screen)
-    drawer.begin(0, {})
-    with pytest.raises(RuntimeError, match="KeyError: 'avatar'"):
-        drawer.take()
-    drawer.begin(0, {"avatar": None})
-    picture, _seconds = drawer.take()
-    np.testing.assert_array_equal(picture, screen.draw(0, {"avatar": None}))
-    drawer._process.kill()
-    with pytest.raises(UserError, match=r"a process that draws ended early \(exit code -9\)"):
-        drawer.take()
-    drawer.end()
+def test_a_picture_that_fails_in_a_process_is_reported(tmp_path):
+    broken = animation(tmp_path)
+    broken.screen.settled = None  # only drawing looks at it
+    with pytest.raises(TypeError, match="NoneType"):
+        list(make_pictures(broken, processes=2, extracts_here=True))
+    assert not multiprocessing.active_children()
 
 
-def test_what_processes_may_be():
-    assert parse_processes("auto") is None
-    assert parse_processes("3") == 3
-    for text in ("0", "-1", "many", "65", "1.5"):
-        with pytest.raises(UserError, match="processes must be auto or a number from 1 to 64"):
-            parse_processes(text)
-    assert choose_processes(4, 100, 128) == 4
-    assert choose_processes(4, 3, 128) == 3
-    assert choose_processes(None, 2, 128) == 1  # not worth a second process
-    assert choose_processes(None, 1000, 100_000) == 1  # no memory for it
-    assert choose_processes(4, 100, 128, extract=False) == 4
-    assert choose_processes(4, 100, 128, extract=False, draw=False) == 1
+def test_number_of_processes_for_frames():
+    assert frame_processes(4, 100, 128) == 4
+    assert frame_processes(4, 3, 128) == 3
+    assert frame_processes(None, 2, 128) == 1  # not worth a second process
+    assert frame_processes(None, 1000, 100_000) == 1  # no memory for it
+    assert frame_processes(4, 100, 128, extract=False) == 4
+    assert frame_processes(4, 100, 128, extract=False, draw=False) == 1

@@ -22,6 +22,7 @@ from omegaconf import OmegaConf
 
 from snarfcli.commands.train import TrainConfig, new_trainer
 from snarfcli.datasets.builtin import builtin_subject
+from snarfcli.hydra_config.schema import config_folder, register_schemas
 from snarfcli.samples.preprocessing import preprocess_subject
 from snarfcli.samples.store import SampleStore
 from snarfcli.samples.writing import SequenceWriter
@@ -37,7 +38,6 @@ from snarfcli.sampling import (
     surface_samples,
     winding_numbers,
 )
-from snarfcli.settings import config_folder, register_schemas
 from snarfcli.training.batches import FrameBatches, FreshBatches
 
 SAMPLING = SamplingSettings(points_per_frame=20_000, surface_noise_m=0.01, padding=0.1, inside_test="winding", seed=0)

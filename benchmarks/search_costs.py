@@ -108,9 +108,9 @@ class _Step:
 
         from snarfcli.commands.train import TrainConfig
         from snarfcli.datasets.builtin import builtin_subject
+        from snarfcli.hydra_config.schema import config_folder, register_schemas
         from snarfcli.models.fast_snarf import FastSnarf
         from snarfcli.models.settings import AvatarConfig
-        from snarfcli.settings import config_folder, register_schemas
 
         register_schemas("train", TrainConfig)
         overrides = ["training=paper", "subject=50002", f"skinning.resolution={list(resolution)}"]

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from snarfcli.cli import main as cli
-from snarfcli.settings import config_folder, group_options, preset_groups
+from snarfcli.hydra_config.schema import config_folder, group_options, preset_groups
 
 NAMES = ("preprocess", "train", "eval", "animate", "export")
 

@@ -27,6 +27,7 @@ LAYERS = (
         "checks",
         "files",
         "formats",
+        "hydra_config",
         "locks",
         "native",
         "parallel",
@@ -35,7 +36,6 @@ LAYERS = (
         "runs",
         "sampling",
         "segments",
-        "settings",
     ),
     ("errors", "names"),
 )

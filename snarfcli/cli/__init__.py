@@ -1,1 +1,1 @@
-"""The command line: flags become Hydra overrides; help, and messages for user errors."""
+"""The command line: flags become Hydra overrides, help texts, messages for user errors."""

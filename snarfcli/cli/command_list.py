@@ -12,25 +12,25 @@ class Command:
     """One subcommand."""
 
     name: str
-    """Name of the configuration file, and of the command on the command line."""
+    """Name on the command line, and of the configuration file."""
     module: str
-    """Module below `snarfcli.commands` with `run` and the configuration's dataclass."""
+    """Module of `snarfcli.commands` with `run` and the dataclass of the configuration."""
     schema: str
     """Name of that dataclass."""
     summary: str
     """What it does, in one line."""
     example: str
-    """A call that works on a fresh machine once the commands before it have run."""
+    """A call that works on a new machine after the examples of the previous commands."""
     flags: dict[str, str]
-    """Flags and the overrides they stand for; `{}` takes the flag's value, `[{}]` those of all times that it is given."""
+    """Flags and their overrides. `{}` takes the value of the flag, `[{}]` the values of all its occurrences."""
     positional: str | None = None
-    """Setting whose value may stand first, without its name."""
+    """Setting whose value can be given as first argument, without its name."""
     lists_of_settings: tuple[str, ...] = ()
     """Settings whose value is a list of settings."""
     folder: str = ""
-    """Folder of its configuration below conf/. Outside of it there are groups, whose names its settings may have therefore."""
+    """Folder of its configuration below conf/; needed where a setting has the name of a configuration group."""
     is_hidden: bool = False
-    """Whether it is only for the program itself."""
+    """Whether only the program itself calls it."""
 
 
 COMMAND_LIST = (
@@ -38,7 +38,7 @@ COMMAND_LIST = (
         "preprocess",
         "preprocess",
         "PreprocessConfig",
-        "sample occupancies from posed meshes",
+        "sample occupancy points from posed meshes",
         "snarf preprocess subject=50002",
         {},
     ),
@@ -54,7 +54,7 @@ COMMAND_LIST = (
         "eval",
         "evaluate",
         "EvalConfig",
-        "IoU on the held-out motion, or on out-of-distribution poses (also: evaluate)",
+        "measure the IoU on held-out motion or on out-of-distribution poses (also: evaluate)",
         "snarf eval --ood subject=50002",
         {"--ood": "split=ood"},
     ),
@@ -62,7 +62,7 @@ COMMAND_LIST = (
         "animate",
         "animate",
         "AnimateConfig",
-        "posed meshes and a video of a motion",
+        "write the posed meshes and a video of a motion",
         "snarf animate --pose seq.npz subject=50002",
         {"--pose": "pose={}"},
     ),
@@ -70,7 +70,7 @@ COMMAND_LIST = (
         "export",
         "export",
         "ExportConfig",
-        "a rigged, animated character for other programs: glb, fbx, usd, or a mesh a frame",
+        "write a rigged, animated character (glb, fbx, usd) or one mesh per frame (ply, obj)",
         "snarf export --pose a.npz --pose b.bvh subject=50002",
         {"--pose": "pose=[{}]"},
     ),
@@ -78,7 +78,7 @@ COMMAND_LIST = (
         "view",
         "view",
         "ViewConfig",
-        "an avatar in the browser: pose it, play motions",
+        "show the avatar in the browser: pose it, play motions",
         "snarf view --pose seq.npz subject=50002",
         {"--pose": "pose=[{}]", "--port": "port={}", "--host": "host={}", "--no-open": "open=false"},
     ),
@@ -86,7 +86,7 @@ COMMAND_LIST = (
         "doctor",
         "doctor",
         "DoctorConfig",
-        "versions, what runs natively and what does not, and why",
+        "check the installation or a data set: versions, native parts, reasons for fallbacks",
         "snarf doctor",
         {},
     ),
@@ -94,7 +94,7 @@ COMMAND_LIST = (
         "reproduce",
         "reproduce",
         "ReproduceConfig",
-        "the papers' tables and figures: table1, table2, ablations, stick2d, clothed or all",
+        "make the papers' tables and figures: table1, table2, ablations, stick2d, clothed or all",
         "snarf reproduce table1 subjects=[50002,50004] training=quick",
         {"--dry-run": "dry_run=true"},
         positional="what",
@@ -105,7 +105,7 @@ COMMAND_LIST = (
         "reproduce_job",
         "reproduce_job",
         "ReproduceJobConfig",
-        "one run of a plan, started by Hydra's launchers",
+        "one run of a plan; called by Hydra's launchers",
         "snarf reproduce_job plan=plan.json job=0",
         {},
         folder="reproduce",

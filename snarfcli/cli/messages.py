@@ -1,4 +1,4 @@
-"""Errors that a user can mend, in one line each."""
+"""User errors as one line each."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["user_message"]
 
 
 def user_message(error: BaseException) -> str | None:
-    """Return one line for an error that a user can mend, or None for a fault of the program."""
+    """Return one line for a user error, or None for a fault of the program."""
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
@@ -38,38 +38,44 @@ def _chain(error: BaseException) -> list[BaseException]:
 
 
 def _file_message(error: OSError) -> str:
-    """Return what went wrong with a file and what to do."""
+    """Return what went wrong with a file, and the next step."""
     name = error.filename2 or error.filename or "a file"
     advice = {
-        errno.ENOSPC: "the disk is full; make room, then run the command again: it goes on where it stopped",
-        errno.EDQUOT: "the disk quota is used up; make room, then run the command again",
+        errno.ENOSPC: "the disk is full; free some space, then run the command again: it continues where it stopped",
+        errno.EDQUOT: "the disk quota is used up; free some space, then run the command again",
         errno.EACCES: "no permission; choose another folder with output_root=... or data_root=...",
         errno.EPERM: "no permission; choose another folder with output_root=... or data_root=...",
         errno.EROFS: "the file system is read-only; choose another folder with output_root=... or data_root=...",
-        errno.ENOTDIR: "a part of the path is a file, not a folder; choose another folder",
+        errno.ENOTDIR: "part of the path is a file, not a folder; choose another folder",
         errno.EISDIR: "is a folder, not a file",
         errno.EEXIST: "is a file, not a folder; choose another folder",
-        errno.ENOENT: "is not there and cannot be made; choose another folder or file",
+        errno.ENOENT: "does not exist and cannot be created; choose another folder or file",
     }
     return f"{name}: {advice.get(error.errno or 0, error.strerror or one_line(error))}"
 
 
 def _config_message(chain: list[BaseException]) -> str:
-    """Return one line for a setting whose value does not fit."""
+    """Return one line for a setting whose value has the wrong type."""
     text = " ".join(one_line(link) for link in chain)
-    unfit = re.search(r"Value '([^']*)'.*? could not be converted to (\w+)", text)
+    unfit = re.search(r"Value '([^']*)'.*? (?:could not be converted to|is not a valid) (\w+)", text)
     key = re.search(r"full_key: ([\w.]+)", text)
     if unfit and key:
-        return f"{key.group(1)} wants {_TYPE_NAMES.get(unfit.group(2), unfit.group(2))}, got '{unfit.group(1)}'"
+        return f"{key.group(1)}: wanted {_TYPE_NAMES.get(unfit.group(2), unfit.group(2))}, got '{unfit.group(1)}'"
     several = re.search(r"override (\S+?)=(\S*).*Cannot convert 'list' to string", text)
     if several:
         one = several.group(2).strip("[]':").split(",")[0]
-        return f"{several.group(1)} takes one value, got a list; write {several.group(1)}={one}"
+        return f"{several.group(1)}: wanted one value, got a list; write {several.group(1)}={one}"
     single = re.search(r"override (\S+?)=(\S*).*is not a ListConfig", text)
     if single:
-        return f"{single.group(1)} wants a list, got {single.group(2)}; write {single.group(1)}=[{single.group(2)}]"
+        return f"{single.group(1)}: wanted a list, got {single.group(2)}; write {single.group(1)}=[{single.group(2)}]"
     lines = dict.fromkeys(" ".join(str(link).strip().splitlines()[0].split()) for link in chain if str(link).strip())
     return ": ".join(list(lines)[:2])
 
 
-_TYPE_NAMES = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false", "String": "a text"}
+_TYPE_NAMES = {
+    "Integer": "a whole number",
+    "Float": "a number",
+    "Boolean": "true or false",
+    "bool": "true or false",
+    "String": "a text",
+}

@@ -26,10 +26,10 @@ from typing import Any
 
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
+from snarfcli.hydra_config.overrides import quote
 from snarfcli.locks import one_of
 from snarfcli.reproduce.jobs import Status, run_job
 from snarfcli.reproduce.plans import Job
-from snarfcli.settings import quote
 
 __all__ = ["LAUNCHERS", "Launcher", "check_launcher", "is_installed", "launch", "run_planned_job"]
 

@@ -12,10 +12,11 @@ from typing import Any
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request, find_source
 from snarfcli.errors import UserError, nearest
+from snarfcli.hydra_config.overrides import quote
+from snarfcli.hydra_config.schema import group_options
 from snarfcli.reproduce.experiments import EXPERIMENTS, Experiment, Row
 from snarfcli.runs import run_folder
 from snarfcli.samples.store import samples_folder
-from snarfcli.settings import group_options, quote
 
 __all__ = ["Choice", "Evaluation", "Job", "Plan", "Samples", "choose_experiments", "make_plan", "unique_jobs"]
 

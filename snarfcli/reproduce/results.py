@@ -53,22 +53,23 @@ COLUMNS = (
 )  # fmt: skip
 """The columns of every table."""
 
-MORE_COLUMNS = tuple(
-    Column(f"{key}_{split}", f"{title} {where}", f"{meaning}, {'held-out motion' if split == 'id' else 'out of distribution'}",
-           split, path, scale, digits)
-    for key, title, meaning, path, scale, digits in (
-        ("chamfer", "Chamfer mm", "mean distance between extracted and true surfaces, both ways, mm",
-         ("surfaces", "chamfer_m"), 1000, 2),
-        ("normals", "normals", "mean cosine between the normals of both surfaces", ("surfaces", "normal_consistency"), 1, 3),
-        ("f_score", "F 5 mm", "F-score at 5 mm of the extracted surface, %", ("surfaces", "f_score"), 100, 1),
-        ("lost", "lost %", "inside points without a correspondence, %", ("inside_without_correspondence",), 100, 2),
-        ("roots", "roots", "correspondences of a point that has any", ("correspondences_per_point",), 1, 2),
-    )
-    for split, where in (("id", "in"), ("ood", "out"))
-) + (
-    Column("wrong_share", "wrong weights %", "learned skinning weight that is on other bones than the body's own, %", "id",
+_BY_SPLIT = (
+    ("chamfer", "Chamfer mm", "mean distance between extracted and true surfaces, both ways, mm",
+     ("surfaces", "chamfer_m"), 1000, 2),
+    ("normals", "normals", "mean cosine between the normals of both surfaces", ("surfaces", "normal_consistency"), 1, 3),
+    ("f_score", "F 5 mm", "F-score at 5 mm of the extracted surface, %", ("surfaces", "f_score"), 100, 1),
+    ("lost", "lost %", "inside points without a correspondence, %", ("inside_without_correspondence",), 100, 2),
+    ("roots", "roots", "correspondences of a point that has any", ("correspondences_per_point",), 1, 2),
+)  # fmt: skip
+MORE_COLUMNS = (
+    *(
+        Column(f"{key}_{split}", f"{title} {short}", f"{meaning}, {long}", split, path, scale, digits)
+        for key, title, meaning, path, scale, digits in _BY_SPLIT
+        for split, short, long in (("id", "in", "held-out motion"), ("ood", "out", "out of distribution"))
+    ),
+    Column("wrong_share", "wrong weights %", "learned skinning weight that is on other bones than in the body model, %", "id",
            ("weights", "wrong_share"), 100),
-    Column("right_bone", "right bone %", "vertices whose heaviest bone is the body's own, %", "id",
+    Column("right_bone", "right bone %", "vertices whose heaviest bone is the same as in the body model, %", "id",
            ("weights", "right_bone"), 100),
 )  # fmt: skip
 """Columns of the second table; those that no run has are left out."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 
 from snarfcli.cli import main as cli
+from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError
-from snarfcli.settings import describe, group_schemas, setting_names
+from snarfcli.hydra_config.schema import describe, group_schemas, setting_names
 
 COMMANDS = ("preprocess", "train", "eval", "animate", "export", "doctor", "reproduce")
 
@@ -60,20 +61,20 @@ def test_configuration_is_complete_and_typed(capsys, name):
 
 
 WRONG = {
-    ("animate", "--pose", "a.npz", "--pose=b.npz"): "--pose can be given once, got it twice",
-    ("animate", "--pose", "a.npz", "pose=b.npz"): "--pose and pose=... say the same thing",
-    ("export", "pose=[b.npz]", "--pose", "a.npz"): "--pose and pose=... say the same thing",
-    ("eval", "--ood", "split=id"): "--ood and split=... say the same thing",
+    ("animate", "--pose", "a.npz", "--pose=b.npz"): "--pose: wanted it once, got it twice",
+    ("animate", "--pose", "a.npz", "pose=b.npz"): "--pose and pose=... set the same value",
+    ("export", "pose=[b.npz]", "--pose", "a.npz"): "--pose and pose=... set the same value",
+    ("eval", "--ood", "split=id"): "--ood and split=... set the same value",
     ("trian",): "unknown command 'trian'; did you mean 'train'?",
     ("train", "subjct=1"): "unknown setting 'subjct'; did you mean 'subject'?",
     ("train", "training.step=3"): "unknown setting 'training.step'; did you mean 'training.steps'?",
     ("train", "+extra=3"): "unknown setting 'extra'",
     ("train", "training=quik"): "there is no training=quik; did you mean 'quick'?; choose from",
     ("train", "search=newton"): "there is no search=newton; choose from broyden, complete",
-    ("train", "training.steps=many"): "training.steps wants a whole number, got 'many'",
-    ("train", "resume=perhaps"): "'perhaps' is not a valid bool",
+    ("train", "training.steps=many"): "training.steps: wanted a whole number, got 'many'",
+    ("train", "resume=perhaps"): "resume: wanted true or false, got 'perhaps'",
     ("train", "--resum"): "unknown flag '--resum'; did you mean '--resume'?",
-    ("train", "~subject"): "'~subject' is no setting",
+    ("train", "~subject"): "wanted a setting NAME=VALUE, got '~subject'",
     ("train", "run=../.."): "run: wanted the name of a folder",
     ("train", "seed=-1"): "seed: wanted at least 0, got -1",
     ("train", "training.validate_every=0"): "training.validate_every: wanted at least 1, got 0",
@@ -81,7 +82,7 @@ WRONG = {
     ("train", "skinning.resolution=[8,8]"): "skinning.resolution: wanted three numbers, along x, y and z, got [8, 8]",
     ("train", "search.jacobian=exat"): "search.jacobian: wanted exact or broyden, got 'exat'; did you mean 'exact'?",
     ("eval", "search=null"): "there is no search=null; choose from broyden, complete, snarf, or leave it out",
-    ("train", "50002"): "'50002' is no setting; write name=value",
+    ("train", "50002"): "wanted a setting NAME=VALUE, got '50002'",
     ("train", "subject='unclosed"): 'cannot read "subject=\'unclosed"',
     ("train", "device=gpu"): "device: wanted auto, cpu, cuda or cuda:N, got 'gpu'",
     ("train", "device=cuda:7"): "device cuda:7 is not there",
@@ -90,9 +91,9 @@ WRONG = {
     ("preprocess", "subject=50003"): "no built-in subject '50003'; did you mean '500",
     ("eval",): 'no avatar in outputs/builtin/50002/fast_snarf; run "snarf train subject=50002" or give ckpt=PATH',
     ("eval", "--ood", "ckpt=none.pt"): "no avatar at none.pt",
-    ("eval", "--ood=yes"): "--ood takes no value",
+    ("eval", "--ood=yes"): "--ood: wanted no value, got '--ood=yes'",
     ("animate",): 'no avatar in outputs/builtin/50002/fast_snarf; run "snarf train subject=50002" or give ckpt=PATH',
-    ("animate", "--pose"): "--pose needs a value",
+    ("animate", "--pose"): "--pose: wanted a value, got none",
 }
 
 
@@ -111,14 +112,14 @@ def test_file_names_with_any_characters_pass_through_flags():
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     for name in ("plain.npz", "with space (1)/a=b,c.npz", "it's {odd}$.npz", "back\\slash.npz", "[x]#:y.npz", "trail\\"):
-        (override,) = cli._translate_flags(command, ["--pose", name])
+        (override,) = translate_flags(command, ["--pose", name])
         assert OverridesParser.create().parse_override(override).value() == name
-        assert cli._translate_flags(command, [f"--pose={name}"]) == [override]
+        assert translate_flags(command, [f"--pose={name}"]) == [override]
 
 
 def test_overrides_and_flags_keep_their_order():
     command = cli.COMMANDS["eval"]
-    assert cli._translate_flags(command, ["subject=1", "-m", "--ood", "--cfg", "job"]) == [
+    assert translate_flags(command, ["subject=1", "-m", "--ood", "--cfg", "job"]) == [
         "subject=1", "split=ood", "-m", "--cfg", "job",
     ]  # fmt: skip
 
@@ -141,13 +142,9 @@ def test_unwritable_and_full_folders_are_named():
 
 
 def test_user_error_inside_another_error_is_found():
-    try:
-        try:
-            raise UserError("the reason")
-        except UserError as inner:
-            raise RuntimeError("outer") from inner
-    except RuntimeError as error:
-        assert user_message(error) == "the reason"
+    error = RuntimeError("outer")
+    error.__cause__ = UserError("the reason")
+    assert user_message(error) == "the reason"
 
 
 def test_interrupt_is_130(capsys, monkeypatch):
@@ -177,4 +174,4 @@ def test_a_list_needs_no_brackets(capsys):
 def test_one_value_given_as_a_list_is_told_how_to_write_it(capsys):
     code, _, error = run(capsys, "animate", "motion=[lunges,splits]")
     assert code == 2
-    assert error == "snarf animate: motion takes one value, got a list; write motion=lunges\n"
+    assert error == "snarf animate: motion: wanted one value, got a list; write motion=lunges\n"

@@ -241,7 +241,7 @@ def test_the_yaml_fits_the_settings():
     from hydra.core.config_store import ConfigStore
     from omegaconf import OmegaConf
 
-    from snarfcli.settings import config_folder
+    from snarfcli.hydra_config.schema import config_folder
 
     for name, schema in (("eval", EvalConfig), ("data", DataConfig), ("search", SearchConfig)):
         ConfigStore.instance().store(group="schema", name=name, node=schema)

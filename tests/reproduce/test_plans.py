@@ -9,10 +9,10 @@ from snarfcli.commands.preprocess import PreprocessConfig
 from snarfcli.commands.reproduce import resolve_training
 from snarfcli.commands.train import TrainConfig
 from snarfcli.errors import UserError
+from snarfcli.hydra_config.overrides import check_overrides
 from snarfcli.reproduce.experiments import EXPERIMENTS
 from snarfcli.reproduce.papers import paper_numbers
 from snarfcli.reproduce.plans import Choice, Job, choose_experiments, make_plan, unique_jobs
-from snarfcli.settings import check_overrides
 
 
 def overrides_of(arguments):

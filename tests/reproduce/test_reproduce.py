@@ -15,8 +15,9 @@ from toy_training import toy_store
 from snarfcli.cli import main as cli
 from snarfcli.commands import reproduce
 from snarfcli.commands.reproduce import ReproduceConfig, run
+from snarfcli.hydra_config.overrides import quote_items
+from snarfcli.hydra_config.schema import config_folder
 from snarfcli.reproduce.jobs import JobStopped, run_job
-from snarfcli.settings import config_folder, quote_items
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ WRONG = {
     ("table1", "launcher=slurm"): "launcher: wanted basic, joblib",
     ("table1", "processes=2"): "launcher=basic runs one job at a time, got processes=2",
     ("table1", "launcher_settings=[gpu]"): "launcher_settings: wanted settings such as [partition=gpu], got 'gpu'",
-    ("table1", "table2"): "'table2' is no setting",
+    ("table1", "table2"): "wanted a setting NAME=VALUE, got 'table2'",
     ("table1", "sistems=[nasa]"): "unknown setting 'sistems'; did you mean 'systems'?",
 }
 

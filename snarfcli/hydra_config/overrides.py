@@ -1,0 +1,110 @@
+"""Overrides such as `training.steps=9`: checks against the dataclasses of a command, and quoting for Hydra's grammar."""
+
+from __future__ import annotations
+
+import re
+import typing
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any
+
+from snarfcli.errors import UserError, nearest, one_line
+from snarfcli.hydra_config.schema import group_options, group_schemas, preset_groups, setting_names
+
+if TYPE_CHECKING:
+    from hydra.core.override_parser.types import Override
+
+__all__ = ["check_overrides", "in_brackets", "quote", "quote_items"]
+
+
+def check_overrides(overrides: Sequence[str], schema: type, command: str = "") -> None:
+    """Check that overrides name settings of a command, and options that its choices have.
+
+    Args:
+        overrides: NAME=VALUE each.
+        schema: the command's dataclass.
+        command: name of the command, for its presets.
+
+    Raises:
+        UserError: an override does not; the message suggests the most similar name.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser = OverridesParser.create()
+    names = setting_names(schema)
+    groups = {name: name for name in group_schemas(schema)} | preset_groups(schema, command)
+    optional = {name for name, hint in typing.get_type_hints(schema).items() if type(None) in typing.get_args(hint)}
+    for text in overrides:
+        try:
+            override = parser.parse_override(text)
+        except HydraException as error:
+            raise UserError(f"cannot read {text!r} ({one_line(error)}); quote special characters: NAME='\"VALUE\"'") from None
+        key = override.key_or_group
+        if key.split(".")[0] == "hydra" or key.startswith("hydra/"):
+            continue
+        if key not in names:
+            raise UserError(f"unknown setting '{key}'{nearest(key, names)}; \"--help\" lists all settings")
+        group = key.split(".")[0]
+        if group != key and group in optional and not any(other.startswith(f"{group}=") for other in overrides):
+            raise UserError(f"{key}: wanted a choice of {group} too; add one, such as {group}={group_options(group)[0]}")
+        if key in groups:
+            _check_options(override, group_options(groups[key]), is_optional=key in optional)
+
+
+def _check_options(override: Override, options: Sequence[str], is_optional: bool) -> None:
+    """Check that a configuration group has the option, or for a sweep all options, that an override chooses."""
+    key = override.key_or_group
+    left_out = ", or leave it out" if is_optional else ""
+    for value in _values(override):
+        option = "null" if value is None else str(value)
+        if option not in options:
+            near = nearest(option, options)
+            raise UserError(f"there is no {key}={option}{near}; choose from {', '.join(options)}{left_out}")
+
+
+def _values(override: Override) -> list[Any]:
+    """Return the value of an override, or all values of a sweep."""
+    if override.is_sweep_override():
+        return [str(value).strip("'\"") for value in override.sweep_string_iterator()]
+    return [override.value()]
+
+
+def in_brackets(override: str, lists: Collection[str]) -> str:
+    """Return an override with brackets added if its setting is a list: views=front,left becomes views=[front,left].
+
+    Args:
+        override: NAME=VALUE.
+        lists: names of the settings that are lists.
+    """
+    name, _, value = override.partition("=")
+    is_bare = name in lists and value not in ("", "null") and not value.startswith("[") and "${" not in value
+    return f"{name}=[{value}]" if is_bare else override
+
+
+def quote(value: str) -> str:
+    """Return a value in quotes, so that Hydra's grammar reads back the same text, for any characters."""
+    # Within quotes only a quote is special, and so are the backslashes that lead up to one.
+    escaped = re.sub(r"(\\*)('|$)", lambda match: match.group(1) * 2 + ("\\'" if match.group(2) else ""), value)
+    return f"'{escaped}'"
+
+
+def quote_items(value: str) -> str:
+    """Return a list of settings, such as [training.steps=9,skinning.resolution=[8,8,4]], with its items in quotes.
+
+    Hydra's grammar allows no bare = inside a list. A value without brackets, and items in quotes, stay as they are.
+    """
+    if not (value.startswith("[") and value.endswith("]")):
+        return value
+    items, depth, open_quote = [""], 0, ""
+    for letter in value[1:-1]:
+        if letter == open_quote:
+            open_quote = ""
+        elif not open_quote and letter in "'\"":
+            open_quote = letter
+        depth += 0 if open_quote else (letter in "[{") - (letter in "]}")
+        if letter == "," and not depth and not open_quote:
+            items.append("")
+        else:
+            items[-1] += letter
+    items = [item.strip() for item in items]
+    return "[" + ",".join(item if not item or item[0] in "'\"" else quote(item) for item in items) + "]"

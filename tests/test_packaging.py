@@ -20,10 +20,10 @@ NEEDS_NM = pytest.mark.skipif(
 )
 
 
-def build_wheel(folder: Path, *options: str, **environment: str) -> Path:
-    """Build the checkout's wheel into an empty folder."""
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(folder), *options]
-    done = subprocess.run([*command, str(ROOT)], env=os.environ | environment, capture_output=True, text=True)
+def build_wheel(folder: Path, checkout: Path = ROOT, **environment: str) -> Path:
+    """Build the wheel of a checkout into an empty folder. Settings go through the environment: pip < 22.1 has no option."""
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(folder)]
+    done = subprocess.run([*command, str(checkout)], env=os.environ | environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     (wheel,) = folder.glob("snarf-*.whl")
     return wheel
@@ -31,7 +31,7 @@ def build_wheel(folder: Path, *options: str, **environment: str) -> Path:
 
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory) -> Path:
-    """The wheel, built once for all processes of the test run, in the build folder of the checkout: it compiles little anew."""
+    """The wheel, built once for all processes of the test run, in the checkout's build folder: little is compiled again."""
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "wheel"
     with FileLock(f"{folder}.lock"):
@@ -46,7 +46,7 @@ def unpack(wheel: Path, folder: Path) -> list[str]:
 
 
 def run_from(site: Path, code: str) -> subprocess.CompletedProcess[str]:
-    """Run code with the unpacked wheel and the installed dependencies; without site, whose hooks would find the checkout."""
+    """Run code with the unpacked wheel and the installed dependencies, without `site`, whose hooks would find the checkout."""
     tests = ROOT / "tests"
     paths = [str(site), *(path for path in sys.path if path and Path(path) != ROOT and not Path(path).is_relative_to(tests))]
     begin = f"import sys; sys.path[1:1] = {paths!r}; import snarfcli; assert {str(site)!r} in snarfcli.__file__; "
@@ -63,7 +63,7 @@ def test_the_wheel_holds_what_is_needed_at_run_time(wheel, tmp_path):
     modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "snarfcli").rglob("*.py")}
     assert configuration
     assert sources
-    assert configuration | sources | modules | {"snarfcli/bodies/body_cc0.npz"} <= names
+    assert configuration | sources | modules | {"snarfcli/bodies/body_cc0.npz", "snarfcli/py.typed"} <= names
     assert [name for name in names if "libsnarf_native" in name] == [_native_name()]
     assert all(name.startswith(("snarfcli/", "snarf-")) for name in names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".o", ".a", ".cpp"))]
@@ -77,8 +77,10 @@ def _native_name() -> str:
 
 def test_the_wheel_runs_from_anywhere(wheel, tmp_path):
     unpack(wheel, tmp_path)
+    (stated,) = re.findall(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     done = run_from(
         tmp_path,
+        f"assert snarfcli.__version__ == {stated!r}; "
         "from snarfcli.bodies import builtin_body; assert len(builtin_body().v_template) == 6890; "
         "from snarfcli.native.library import choose_backend, library_path; "
         f"assert choose_backend('native') == 'native' and {str(tmp_path)!r} in str(library_path()); "
@@ -91,7 +93,7 @@ def test_the_wheel_runs_from_anywhere(wheel, tmp_path):
 def test_without_a_compiler_the_wheel_runs_on_the_reference_with_one_warning(tmp_path):
     folder = tmp_path / "wheel"
     compilers = {"CC": "/nonexistent/cc", "CXX": "/nonexistent/c++"}
-    names = unpack(build_wheel(folder, "-C", f"build-dir={tmp_path / 'build'}", **compilers), tmp_path / "site")
+    names = unpack(build_wheel(folder, SKBUILD_BUILD_DIR=str(tmp_path / "build"), **compilers), tmp_path / "site")
     assert not [name for name in names if "libsnarf_native" in name]
     done = run_from(
         tmp_path / "site",
@@ -106,17 +108,13 @@ def test_without_a_compiler_the_wheel_runs_on_the_reference_with_one_warning(tmp
 
 
 def test_a_source_that_does_not_compile_leaves_the_library_out(tmp_path):
-    """As on a compiler nobody has tried: the build goes on without the library."""
+    """As with an untested compiler: the build goes on without the library."""
     copy = tmp_path / "checkout"
     shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".*", "build", "data", "outputs", "tests", "*.so"))
     (copy / "csrc/cpu/library.cpp").write_text("#error no such compiler\n")
     for kernel in copy.glob("csrc/cpu/kernel*.cpp"):
         kernel.write_text("")
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(tmp_path), str(copy)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    (wheel,) = tmp_path.glob("snarf-*.whl")
-    unpack(wheel, tmp_path / "site")
+    unpack(build_wheel(tmp_path / "wheel", copy), tmp_path / "site")
     done = run_from(tmp_path / "site", "from snarfcli.native.library import choose_backend; choose_backend('auto')")
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("Warning") == 1
@@ -135,7 +133,7 @@ def test_the_source_distribution_builds(tmp_path):
 
 
 def defined_symbols(file: Path, *flags: str) -> set[str]:
-    """Return the names that an object file or library defines for others, mangled."""
+    """Return the mangled names of the external symbols that an object file or library defines."""
     command = ["nm", "--defined-only", "--extern-only", "--format=posix", *flags, str(file)]
     lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
     return {line.split()[0] for line in lines if line.strip()}
@@ -152,7 +150,7 @@ def test_the_library_exports_its_interface_only(wheel, tmp_path):
 @NEEDS_NM
 @pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
 def test_kernels_define_nothing_outside_their_namespace(wheel, isa):
-    """The linker merges functions of one name: std::vector compiled for AVX-512 would end other processors' programs."""
+    """The linker merges functions of the same name: a std::vector compiled for AVX-512 would crash on other processors."""
     objects = list((ROOT / "build").glob(f"py3-none-*/CMakeFiles/snarf_kernels_{isa}.dir/**/*.o"))
     if not objects and isa != "baseline":
         pytest.skip(f"this processor or compiler has no {isa}")

@@ -1,19 +1,18 @@
-"""Run folders: where results go, and the facts that every run records."""
+"""Run folders, devices and seeds, and the facts that every run records."""
 
 from __future__ import annotations
 
 import os
 import platform
 import random
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-import snarfcli
 from snarfcli.errors import UserError, nearest
+from snarfcli.versions import recorded_versions
 
 __all__ = ["choose_device", "find_avatar", "machine_facts", "run_folder", "seed_everything", "set_threads"]
 
@@ -22,7 +21,7 @@ def run_folder(output_root: str, data: str, subject: str, run: str) -> Path:
     """Return the folder of one run: `<output_root>/<data>/<subject>/<run>`.
 
     Raises:
-        UserError: a name is empty or leads elsewhere; a run may be replaced as a whole, so it must have a folder of its own.
+        UserError: a name is empty or contains a path. (overwrite=true deletes the folder, so it must belong to this run alone.)
     """
     for name, value in (("data.name", data), ("subject", str(subject)), ("run", run)):
         if value in ("", ".", "..") or any(separator in value for separator in "/\\:"):
@@ -34,13 +33,13 @@ def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str |
     """Return the file of a trained avatar.
 
     Raises:
-        UserError: there is none; the message names the command that makes one.
+        UserError: it does not exist; the message names the command that trains one.
     """
     if ckpt is not None:
         path = Path(ckpt)
         path = path / "avatar.pt" if path.is_dir() else path
         if not path.is_file():
-            raise UserError(f'no avatar at {ckpt} (ckpt); give the avatar.pt that "snarf train" wrote')
+            raise UserError(f'no avatar at {ckpt} (ckpt); give the avatar.pt that "snarf train" has written')
         return path
     folder = run_folder(output_root, data, subject, run)
     if not (folder / "avatar.pt").is_file():
@@ -52,10 +51,10 @@ def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str |
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the device named "auto" (a GPU where there is one), "cpu", "cuda" or "cuda:N".
+    """Return the device named "auto" (a GPU if PyTorch sees one), "cpu", "cuda" or "cuda:N".
 
     Raises:
-        UserError: the name is unknown or the device is not there.
+        UserError: the name is unknown or PyTorch does not see the device.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -67,12 +66,12 @@ def choose_device(name: str) -> torch.device:
         raise UserError(f"device: wanted auto, cpu, cuda or cuda:N, got {name!r}")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         seen = torch.cuda.device_count()
-        raise UserError(f"device {name} is not there: PyTorch {torch.__version__} sees {seen} GPUs; use device=cpu")
+        raise UserError(f"device: wanted {name}, got {seen} GPUs (PyTorch {torch.__version__}); use device=cpu")
     return device
 
 
 def set_threads(threads: int | None) -> None:
-    """Use so many threads for tensor work; None leaves PyTorch's choice, which follows OMP_NUM_THREADS."""
+    """Set the number of threads for tensor work; None keeps PyTorch's choice, which follows OMP_NUM_THREADS."""
     if threads is not None:
         if threads < 1:
             raise UserError(f"threads: wanted at least 1, got {threads}")
@@ -80,25 +79,19 @@ def set_threads(threads: int | None) -> None:
 
 
 def seed_everything(seed: int) -> None:
-    """Seed the generators of Python, NumPy and PyTorch."""
+    """Seed the random number generators of Python, NumPy and PyTorch."""
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
 
 
 def machine_facts() -> dict[str, Any]:
-    """Return the versions and the machine that a result was made with."""
-    versions = {"snarf": snarfcli.__version__, "python": platform.python_version(), "torch": torch.__version__}
-    for package in ("numpy", "scikit-image", "trimesh", "libigl", "pymeshlab"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
+    """Return the versions and the machine of a result, as `versions` and `machine`."""
     machine = {"system": platform.system(), "processor": _processor(), "cores": os.cpu_count()}
     machine["threads"] = torch.get_num_threads()
     if torch.cuda.is_available():
         machine["gpu"] = torch.cuda.get_device_name()
-    return {"versions": versions, "machine": machine}
+    return {"versions": recorded_versions(), "machine": machine}
 
 
 def _processor() -> str:

@@ -37,7 +37,7 @@ LAYERS = (
         "sampling",
         "segments",
     ),
-    ("errors", "names"),
+    ("errors", "names", "versions"),
 )
 """Folders and top-level modules of the package, from the top; those of one layer do not know each other."""
 

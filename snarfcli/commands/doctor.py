@@ -1,4 +1,7 @@
-"""`snarf doctor`: what is installed, what runs natively, and where a fallback runs instead and why."""
+"""`snarf doctor`: what is installed, what runs natively, and where a fallback runs instead and why.
+
+Imports of PyTorch and of rooms that need it stand inside functions: the report must also work when they are broken.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from omegaconf import MISSING
@@ -18,13 +20,17 @@ import snarfcli
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import one_line
 from snarfcli.parallel import count_cores
+from snarfcli.versions import RECORDED_PACKAGES, installed_version
 
 __all__ = ["DoctorConfig", "Finding", "run"]
 
 log = logging.getLogger(__name__)
 
-_SUBJECTS_CHECKED = 3  # of a data set, which take some seconds each
-_LISTED = 8  # names of data or runs on one line; a long list helps nobody
+_SUBJECTS_CHECKED = 3  # of a data set; each takes some seconds
+_LISTED = 8  # names of data or runs on one line
+_TOOLS = {"embreex": "embreex.rtcore_scene", "libigl": "igl", "pymeshlab": "pymeshlab"}
+"""Compiled packages that are imported to see whether they work, and the module that shows it."""
+_OTHER_PACKAGES = ("scipy", "hydra-core", "tensorboard")
 
 
 @dataclass
@@ -32,17 +38,17 @@ class DoctorConfig:
     """Settings of `snarf doctor`."""
 
     data_root: str = MISSING
-    """Folder to look for data and processed samples in."""
+    """Folder with the data and the processed samples."""
     output_root: str = MISSING
-    """Folder to look for trained avatars in."""
+    """Folder with the trained avatars."""
     data: DataConfig | None = None
-    """A data set to check instead of the installation."""
+    """Data set to check, instead of the installation."""
     subject: str | None = None
-    """Subject of it to check; null for the first few."""
+    """Subject of the data set to check; all for every subject, null for the first three."""
     body: str | None = None
-    """Body model, or a folder with it; null: looked for below data_root."""
+    """Body model file, or a folder with it; null searches below data_root."""
     figure: str | None = None
-    """Where the picture of the data goes; null: <output_root>/doctor/<data>_<subject>.png."""
+    """File for the picture of the data; null for <output_root>/doctor/<data>_<subject>.png."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +58,14 @@ class Finding:
     name: str
     text: str
     is_fallback: bool = False
-    """Whether something slower, or nothing, takes the place of what is described."""
+    """Whether the described part is missing, or replaced by a slower one."""
 
 
 def run(config: DoctorConfig) -> int:
-    """Print what is there. A broken part is reported like any other: the other parts are still looked at.
+    """Print the report. A part that cannot be examined is reported with its error, and the other parts follow.
 
     Returns:
-        0, also where fallbacks are in use; 2 if a data set was to be checked and cannot be used.
+        0, also if fallbacks are in use; 2 if the data set to check cannot be used.
     """
     if config.data is not None:
         return _check_data(config, config.data)
@@ -71,9 +77,9 @@ def run(config: DoctorConfig) -> int:
         "data": lambda: _data(Path(config.data_root), Path(config.output_root)),
     }
     fallbacks: list[str] = []
-    for title, look in sections.items():
+    for title, examine in sections.items():
         log.info("%s", title)
-        for finding in _survey(look):
+        for finding in _findings(examine):
             log.info("  %-16s%s", finding.name, finding.text)
             if finding.is_fallback:
                 fallbacks.append(finding.name)
@@ -83,7 +89,7 @@ def run(config: DoctorConfig) -> int:
 
 
 def _check_data(config: DoctorConfig, data: DataConfig) -> int:
-    """Say whether a data set can be used, and what to mend; draw each subject that is looked at."""
+    """Report whether a data set can be used and what to correct; draw each examined subject."""
     from snarfcli.datasets.checking import LookedAt, Remark, check_subject
     from snarfcli.datasets.sources import Request, find_source
     from snarfcli.datasets.subjects import SubjectData
@@ -112,7 +118,7 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
                 unusable.append(subject)
     log.info("")
     if len(chosen) < len(subjects):
-        log.info("%d subjects more; give subject=NAME or subject=all", len(subjects) - len(chosen))
+        log.info("%d more subjects were not checked; give subject=NAME or subject=all", len(subjects) - len(chosen))
     if unusable:
         log.info("not usable as it is: %s (see PROBLEM above)", _listed(unusable))
     else:
@@ -124,11 +130,11 @@ def _folder_setting(data: DataConfig) -> str:
     return f" data.folder={data.folder}" if data.folder is not None else ""
 
 
-def _survey(look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+def _findings(examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     """Yield the findings of a section, the last one being the error that ended it, if any."""
     try:
-        yield from look()
-    except Exception as error:  # a broken installation is what this command is for
+        yield from examine()
+    except Exception as error:  # anything can fail in a broken installation, which this command exists to explain
         yield Finding("error", _describe_error(error), is_fallback=True)
 
 
@@ -141,18 +147,19 @@ def _versions() -> Iterator[Finding]:
     yield Finding("python", f"{platform.python_version()}, {sys.executable}")
     yield Finding("platform", f"{platform.platform()}, {platform.machine()}")
     yield _package("torch", "torch", "torch")
-    for package in ("numpy", "scipy", "scikit-image", "trimesh", "hydra-core", "tensorboard"):
-        yield _package(package, package)
+    for package in (*RECORDED_PACKAGES, *_OTHER_PACKAGES):
+        if package not in ("snarf", "torch", *_TOOLS):
+            yield _package(package, package)
 
 
 def _package(name: str, package: str, module: str | None = None) -> Finding:
-    """Return the version of an installed package; with `module`, whether that can be imported."""
+    """Return the version of a package and, if `module` is given, whether that module can be imported."""
+    installed = installed_version(package)
+    if installed is None:
+        return Finding(name, f'not installed; run "pip install {package}"', is_fallback=True)
     try:
-        installed = version(package)
         if module is not None:
             importlib.import_module(module)
-    except PackageNotFoundError:
-        return Finding(name, f'not installed; run "pip install {package}"', is_fallback=True)
     except Exception as error:
         return Finding(name, f"{package} {installed} cannot be imported: {_describe_error(error)}", is_fallback=True)
     return Finding(name, f"{package} {installed}" if name != package else installed)
@@ -169,7 +176,7 @@ def _processor() -> Iterator[Finding]:
 
 
 def _native() -> Finding:
-    """Return whether the native library runs, or why not."""
+    """Return whether the native library is active, or the reason why not."""
     from snarfcli.native.library import build_note, instruction_set, library_path, why_unavailable
 
     reason = why_unavailable()
@@ -185,7 +192,7 @@ def _gpu() -> Iterator[Finding]:
 
     count = torch.cuda.device_count()
     yield Finding("PyTorch", f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA")
-    yield Finding("devices", "none; everything runs on the processor" if not count else f"{count}")
+    yield Finding("devices", "none; everything runs on the CPU" if not count else f"{count}")
     for index in range(count):
         device = torch.cuda.get_device_properties(index)
         memory = f"{device.total_memory / 2**30:.1f} GiB"
@@ -198,13 +205,12 @@ def _gpu() -> Iterator[Finding]:
 
 def _tools() -> Iterator[Finding]:
     yield _ffmpeg()
-    yield _package("embree", "embreex", "embreex.rtcore_scene")
-    yield _package("libigl", "libigl", "igl")
-    yield _package("pymeshlab", "pymeshlab", "pymeshlab")
+    for package, module in _TOOLS.items():
+        yield _package("embree" if package == "embreex" else package, package, module)
 
 
 def _ffmpeg() -> Finding:
-    """Return which ffmpeg writes videos."""
+    """Return the ffmpeg that writes videos."""
     try:
         import imageio_ffmpeg
 
@@ -227,7 +233,7 @@ def _data(data_root: Path, output_root: Path) -> Iterator[Finding]:
 
 
 def _names(root: Path, pattern: str) -> list[str]:
-    """Return the folders below `root` that hold files of a pattern."""
+    """Return the folders below `root` that contain files matching a pattern."""
     return sorted(path.parent.relative_to(root).as_posix() for path in root.glob(pattern))
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
-import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +26,7 @@ from snarfcli.samples.writing import (
     write_manifest,
 )
 from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, sample_frames
+from snarfcli.versions import recorded_versions
 
 __all__ = ["preprocess_subject"]
 
@@ -35,7 +34,6 @@ log = logging.getLogger(__name__)
 
 _FRAMES_PER_TASK = 30  # 3 to 4 s of work for 0.4 s of starting a process; the samples depend on it, see snarfcli/parallel.py
 _FRAMES_CHECKED = 200  # that a process only reads
-_PACKAGES = ("snarf", "numpy", "torch", "libigl", "pymeshlab", "trimesh", "embreex")
 
 
 @dataclass
@@ -117,7 +115,7 @@ def preprocess_subject(
                 "sources": list(subject.sources),
                 "skipped": [{"name": name, "reason": reason} for name, reason in dict([*subject.broken, *broken]).items()],
                 "settings": settings,
-                "versions": _versions(),
+                "versions": recorded_versions(),
             }
             manifest = write_manifest(folder, header, entries)
         except BaseException as error:
@@ -266,16 +264,6 @@ def _report_sequence(entry: Mapping[str, Any]) -> None:
     )  # fmt: skip
     if entry["inside_share"] == 0:
         log.warning("warning: no point of %s is inside; are its meshes surfaces of a body, with faces outward?", entry["name"])
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = "not installed"
-    return versions
 
 
 def _report(manifest: Mapping[str, Any], frames: int, points_per_frame: int, seconds: float) -> None:

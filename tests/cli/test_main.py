@@ -85,7 +85,7 @@ WRONG = {
     ("train", "50002"): "wanted a setting NAME=VALUE, got '50002'",
     ("train", "subject='unclosed"): 'cannot read "subject=\'unclosed"',
     ("train", "device=gpu"): "device: wanted auto, cpu, cuda or cuda:N, got 'gpu'",
-    ("train", "device=cuda:7"): "device cuda:7 is not there",
+    ("train", "device=cuda:7"): "device: wanted cuda:7, got ",
     ("train", "threads=0", "data_root=none"): "threads: wanted at least 1, got 0",
     ("train",): 'no samples of subject 50002 under data/processed/builtin; run "snarf preprocess',
     ("preprocess", "subject=50003"): "no built-in subject '50003'; did you mean '500",

@@ -135,6 +135,6 @@ def test_several_subjects_are_checked_and_the_others_named(caplog, tmp_path):
         (tmp_path / f"{name}.glb").write_bytes(animal_glb(ANIMAL, MOTIONS))
     code, lines = checked(caplog, tmp_path)
     assert code == 0
-    assert "1 subjects more; give subject=NAME or subject=all" in lines
+    assert "1 more subjects were not checked; give subject=NAME or subject=all" in lines
     assert [line for line in lines if line.startswith("subject ")] == ["subject a", "subject b", "subject c"]
     assert line_with(lines, "rigged file")

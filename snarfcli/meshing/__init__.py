@@ -1,4 +1,4 @@
-"""Surface extraction: coarse-to-fine evaluation, marching cubes, posed surfaces of avatars."""
+"""Surfaces of fields and avatars: coarse-to-fine evaluation, marching cubes, posed and skinned meshes, mesh files."""
 
 from snarfcli.meshing.extract import EmptySurface, FullSurface, extract_surface
 from snarfcli.meshing.mesh import ExtractionStats, Mesh, vertex_normals

@@ -1,10 +1,9 @@
 """Watertight surfaces of fields: coarse-to-fine evaluation and marching cubes.
 
 The field is evaluated on a coarse lattice first. Cells whose corners differ in sign, and their neighbours, are split in two
-along each axis and evaluated again, down to the wanted resolution (MISE: Mescheder et al., Occupancy Networks, CVPR 2019,
-section 3.3). A cell with mixed signs whose corners are not all known is then completed, and so on outwards, until
-no surface ends where the evaluation ended: away from features that the coarse lattice misses altogether, the mesh is
-the one of the full lattice.
+along each axis and evaluated again, down to the requested resolution (MISE: Mescheder et al., Occupancy Networks, CVPR 2019,
+section 3.3). Then the unknown corners of cells with mixed signs are evaluated, and so on outwards, until no surface ends at
+the edge of the evaluated region. Except for features that the coarse lattice misses, the mesh equals that of the full lattice.
 """
 
 from __future__ import annotations
@@ -22,23 +21,24 @@ from snarfcli.meshing.mesh import ExtractionStats, Mesh, keep_components
 
 __all__ = ["EmptySurface", "FullSurface", "extract_surface"]
 
-# First lattice, cells along the longest side: a quarter of the resolution, within these bounds. 64 are 3 cm on a standing body.
-# What is joined to something that the first lattice meets is followed however thin it is, so this matters for loose parts.
+# Minimum and maximum number of cells of the first lattice along the longest side, by default a quarter of the resolution. 64
+# are 3 cm on a standing body. Thin parts that join a part found by the first lattice are followed, so this matters only for
+# loose parts.
 _COARSE = (32, 64)
-# Cells around the mixed ones that are split as well, on all levels but the last.
+# Width, in cells, of the layer around mixed cells that is split as well, on all levels but the last.
 _DILATE = 1
-# Times that a box is widened, each by a sixteenth of its longest side.
+# Maximum number of times that a box is widened, each time by a sixteenth of its longest side.
 _WIDENINGS = 8
-# Node layers looked at together: bounds the memory, not the result.
+# Node layers processed at once: bounds the memory, does not change the result.
 _SLAB = 32
 
 
 class EmptySurface(ValueError):
-    """The field is unoccupied everywhere in the box, so there is no surface."""
+    """The field has no surface: it is unoccupied everywhere in the box."""
 
 
 class FullSurface(ValueError):
-    """The field is occupied everywhere in the box, so there is no surface."""
+    """The field has no surface: it is occupied everywhere in the box."""
 
 
 def extract_surface(
@@ -55,27 +55,27 @@ def extract_surface(
     keep_share: float = 0.01,
     chunk: int = 65536,
 ) -> Mesh:
-    """Extract the surface where `field` crosses `level` inside a box, as a closed mesh of outward triangles.
+    """Extract the surface where `field` crosses `level` in a box, as a closed mesh of outward triangles.
 
     Args:
         field: points [N, 3] float32 on the CPU -> values [N] on any device; occupied where above `level`. Infinite
-            values are allowed. Each point must have a value of its own, whatever points come with it.
-        lower: [3] corner of the box, metres.
-        upper: [3] opposite corner.
-        resolution: cells along the longest side of the box; cells are cubes.
+            values are allowed. The value at a point must not depend on the other points of the call.
+        lower: [3], lower corner of the box, metres.
+        upper: [3], upper corner of the box, metres.
+        resolution: number of cells along the longest side of the box; cells are cubes.
         level: value at the surface.
-        coarse: cells along the longest side of the first lattice, at least; loose parts smaller than such a cell can be
-            missed. By default a quarter of `resolution`, within 32 and 64.
-        dilate: cells around the surface that are split as well, on all levels but the last.
-        widen: where the field is occupied at the border of the box, move the border outwards until it is not, or the box is
-            two and a half times as large. For boxes that are an estimate.
-        refine: evaluations at each vertex that move it along its lattice edge to where the field really crosses `level`.
-            Without one, a field that is not linear within a cell shows terraces.
-        keep_share: connected surfaces with fewer faces than this share of the largest one's are dropped.
-        chunk: points in one call of the field.
+        coarse: minimum number of cells of the first lattice along the longest side; loose parts smaller than such a cell can be
+            missed. None: a quarter of `resolution`, at least 32 and at most 64.
+        dilate: width, in cells, of the layer around the surface that is split as well, on all levels but the last.
+        widen: whether a box that is only an estimate grows: a side with an occupied border moves outwards until the border is
+            unoccupied, or the box is two and a half times as large.
+        refine: number of evaluations per vertex that move it along its lattice edge to the crossing of `level`. With 0, a field
+            that is not linear in a cell shows terraces.
+        keep_share: a connected surface with fewer faces than this share of the largest one is dropped.
+        chunk: maximum number of points per call of the field.
 
     Returns:
-        vertices in the frame of the box, with `stats`. A surface that leaves the box is closed at its border.
+        The mesh in the frame of the box, with `stats`. A surface that leaves the box is closed at its border.
 
     Raises:
         EmptySurface: no evaluated point is occupied.
@@ -144,7 +144,7 @@ def _descend(
     """Refine from the first lattice, all of whose values are known, to the last.
 
     Returns:
-        the last lattice, its values, and the sides, bool [3, 2], on which occupied nodes had to be closed.
+        The last lattice, its values, and the sides on which occupied nodes were closed, bool [3, 2].
     """
     known = np.ones(lattice.shape, dtype=bool)
     sides = _close_border(values)
@@ -164,7 +164,7 @@ def _descend(
 
 
 def _split(lattice: Lattice, values: np.ndarray, known: np.ndarray) -> tuple[Lattice, np.ndarray, np.ndarray]:
-    """Halve the cells. New nodes take the value of a neighbour until they are evaluated, so their signs are right."""
+    """Halve the cells. New nodes take the value of a neighbour until they are evaluated, which keeps their signs correct."""
     finer = lattice.split()
     fine_values = np.empty(finer.shape, dtype=np.float32)
     rows = values.repeat(2, axis=2)[:, :, :-1]
@@ -177,10 +177,10 @@ def _split(lattice: Lattice, values: np.ndarray, known: np.ndarray) -> tuple[Lat
 
 
 def _complete(evaluator: _Evaluator, lattice: Lattice, values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Evaluate the unknown corners of mixed cells, and around them, until every mixed cell is known.
+    """Evaluate the unknown corners of mixed cells, and around them, until all corners of mixed cells are known.
 
     Returns:
-        the sides on which occupied nodes had to be closed, bool [3, 2].
+        The sides on which occupied nodes were closed, bool [3, 2].
     """
     sides = np.zeros((3, 2), dtype=bool)
     while True:
@@ -196,7 +196,7 @@ def _complete(evaluator: _Evaluator, lattice: Lattice, values: np.ndarray, known
 
 
 def _unfinished(values: np.ndarray, known: np.ndarray) -> np.ndarray | None:
-    """Return the mixed cells that have an unknown corner, or None if there are none; slab by slab, to save memory."""
+    """Return the mixed cells that have an unknown corner, or None if there are none; computed in slabs to save memory."""
     cells = None
     for begin in range(0, values.shape[0] - 1, _SLAB):
         part = slice(begin, begin + _SLAB + 1)
@@ -212,14 +212,14 @@ def _unfinished(values: np.ndarray, known: np.ndarray) -> np.ndarray | None:
 
 
 def _faces(values: np.ndarray) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yield axis, end (0 or 1) and view of the six outermost layers of nodes."""
+    """Yield the six outermost layers of nodes: axis, end (0 or 1) and a view."""
     for axis in range(3):
         for end in (0, 1):
             yield axis, end, values[(slice(None),) * axis + (-end,)]
 
 
 def _occupied_sides(values: np.ndarray) -> np.ndarray:
-    """Return which sides have an occupied node on the border, bool [3, 2]."""
+    """Return which sides have occupied border nodes, bool [3, 2]."""
     sides = np.zeros((3, 2), dtype=bool)
     for axis, end, face in _faces(values):
         sides[axis, end] = (face > 0).any()
@@ -227,7 +227,7 @@ def _occupied_sides(values: np.ndarray) -> np.ndarray:
 
 
 def _close_border(values: np.ndarray) -> np.ndarray:
-    """Make the outermost nodes unoccupied; return on which sides some were not, bool [3, 2]."""
+    """Make the outermost nodes unoccupied; return the sides on which some were occupied, bool [3, 2]."""
     sides = _occupied_sides(values)
     for _, _, face in _faces(values):
         np.negative(face, out=face, where=face > 0)
@@ -235,7 +235,7 @@ def _close_border(values: np.ndarray) -> np.ndarray:
 
 
 def _place(evaluator: _Evaluator, lattice: Lattice, crossings: Crossings, refine: int) -> np.ndarray:
-    """Return the vertices [V, 3] float32: where the field crosses zero on its lattice edges, by false position."""
+    """Return the vertices [V, 3] float32: the zeros of the field on the lattice edges, by false position."""
     low, high = np.zeros(len(crossings.axis)), np.ones(len(crossings.axis))
     value_low, value_high = crossings.value_a.copy(), crossings.value_b.copy()
     for step in range(refine + 1):
@@ -245,14 +245,14 @@ def _place(evaluator: _Evaluator, lattice: Lattice, crossings: Crossings, refine
         vertices = (lattice.origin + nodes * lattice.spacing).astype(np.float32)
         if step < refine:
             value = evaluator.at(vertices).astype(np.float64)
-            below = (value > 0) == (value_low > 0)  # the crossing is further along
+            below = (value > 0) == (value_low > 0)  # the zero is further along
             low, value_low = np.where(below, along, low), np.where(below, value, value_low)
             high, value_high = np.where(below, high, along), np.where(below, value_high, value)
     return vertices
 
 
 class _Evaluator:
-    """Evaluates the field at lattice nodes, chunk by chunk, and counts."""
+    """Evaluates the field at lattice nodes in chunks, and counts points and calls."""
 
     def __init__(self, field: Callable[[Tensor], Tensor], level: float, chunk: int) -> None:
         self.field = field
@@ -271,7 +271,7 @@ class _Evaluator:
 
     @torch.no_grad()
     def at(self, positions: np.ndarray) -> np.ndarray:
-        """Return field minus level at positions [N, 3] float32, never infinite, [N] float32."""
+        """Return field minus level, [N] float32 and finite, at positions [N, 3] float32."""
         out = np.empty(len(positions), dtype=np.float32)
         largest = np.finfo(np.float32).max / 4
         for begin in range(0, len(positions), self.chunk):
@@ -279,7 +279,7 @@ class _Evaluator:
             points = torch.from_numpy(positions[part])
             result = self.field(points)
             if result.shape != points.shape[:1]:
-                raise ValueError(f"field: wanted {len(points)} values for as many points, got shape {list(result.shape)}")
+                raise ValueError(f"field: wanted shape [{len(points)}], one value per point, got {list(result.shape)}")
             result_np = result.detach().to("cpu", torch.float32).numpy() - np.float32(self.level)
             if np.isnan(result_np).any():
                 raise ValueError(f"field: wanted numbers, got NaN at {np.isnan(result_np).sum()} of {len(points)} points")

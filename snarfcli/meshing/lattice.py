@@ -1,4 +1,4 @@
-"""Regular lattices, and boolean arithmetic on their nodes and cells; there is one cell less than nodes along each axis."""
+"""Regular lattices and boolean arithmetic on their nodes and cells; along each axis there is one cell fewer than nodes."""
 
 from __future__ import annotations
 
@@ -15,32 +15,36 @@ __all__ = ["Lattice", "any_corner", "first_lattice", "grow", "mixed_cells", "nod
 class Lattice:
     """Nodes at `origin + spacing * stride * index`.
 
-    The spacing is the one of the final lattice on every level, so that a node has the same position on all of them, to the bit.
+    All levels use the spacing of the final lattice, so that a node has exactly the same position on each level.
     """
 
     origin: np.ndarray
+    """[3], position of the first node, metres."""
     spacing: float
+    """Cell size of the final lattice, metres."""
     stride: int
+    """Cell size of this lattice in cells of the final one; a power of two."""
     shape: tuple[int, ...]
+    """Number of nodes along each axis."""
 
     def split(self) -> Lattice:
         """Return the lattice with half the cell size."""
         return Lattice(self.origin, self.spacing, self.stride // 2, tuple(2 * n - 1 for n in self.shape))
 
     def positions(self, flat: np.ndarray) -> np.ndarray:
-        """Return the positions of nodes, [N, 3] float32, given by their flat index [N]."""
+        """Return the positions [N, 3] float32, metres, of nodes with flat indices [N]."""
         index = np.stack(np.unravel_index(flat, self.shape), axis=1) * self.stride
         return (self.origin + index * self.spacing).astype(np.float32)
 
 
 def first_lattice(lower: Tensor | np.ndarray, upper: Tensor | np.ndarray, resolution: int, coarse: int) -> Lattice:
-    """Return the coarsest lattice: a box with one cell around it, centred on it.
+    """Return the coarsest lattice: centred on a box, with a margin of one cell.
 
     Args:
-        lower: [3] corner of the box, metres.
-        upper: [3] opposite corner.
-        resolution: cells of the final lattice along the longest side.
-        coarse: cells of the coarsest lattice along the longest side, at least.
+        lower: [3], lower corner of the box, metres.
+        upper: [3], upper corner of the box, metres.
+        resolution: number of cells of the final lattice along the longest side.
+        coarse: minimum number of cells of the coarsest lattice along the longest side.
 
     Raises:
         ValueError: a corner is not finite, the box is empty, or a number is too small.
@@ -60,13 +64,14 @@ def first_lattice(lower: Tensor | np.ndarray, upper: Tensor | np.ndarray, resolu
     while resolution >= 2 * stride * coarse:
         stride *= 2
     spacing = size.max() / resolution
-    # The small number keeps rounding from adding a layer of cells to a box that is a multiple of a cell.
+    # The small number prevents rounding from adding a layer of cells to a box that is a multiple of a cell.
     cells = np.ceil(size / (spacing * stride) - 1e-6).astype(int) + 2
     origin = (corners[0] + corners[1] - cells * spacing * stride) / 2
     return Lattice(origin=origin, spacing=spacing, stride=stride, shape=tuple(int(n) + 1 for n in cells))
 
 
 def _pair(nodes: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return views of all entries but the last along an axis, and of all but the first."""
     rest = (slice(None),) * axis
     return nodes[(*rest, slice(None, -1))], nodes[(*rest, slice(1, None))]
 
@@ -91,7 +96,7 @@ def mixed_cells(nodes: np.ndarray) -> np.ndarray:
 
 
 def nodes_of_cells(cells: np.ndarray) -> np.ndarray:
-    """Return the corners of true cells."""
+    """Return the nodes at the corners of true cells."""
     for axis in range(3):
         shape = list(cells.shape)
         shape[axis] += 1
@@ -104,7 +109,7 @@ def nodes_of_cells(cells: np.ndarray) -> np.ndarray:
 
 
 def grow(cells: np.ndarray, steps: int) -> None:
-    """Set the neighbours of true cells, across faces, edges and corners, in place."""
+    """Set the neighbours of true cells across faces, edges and corners, in place, `steps` times."""
     for _ in range(steps):
         for axis in range(3):
             first, second = _pair(cells, axis)

@@ -1,30 +1,32 @@
-"""A triangle mesh as it passes between extraction, files and pictures."""
+"""Triangle meshes with vertex attributes, and their connected surfaces."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 __all__ = ["ExtractionStats", "Mesh", "face_components", "keep_components", "vertex_normals"]
 
 
 @dataclass(frozen=True)
 class ExtractionStats:
-    """What an extraction cost and found."""
+    """Cost and result of an extraction."""
 
     points: int
-    """Points at which the field was evaluated."""
+    """Number of points at which the field was evaluated."""
     calls: int
-    """Calls of the field."""
+    """Number of calls of the field."""
     voxel: float
     """Edge length of a final cell, metres."""
     components: int
-    """Connected surfaces found."""
+    """Number of connected surfaces found."""
     kept: int
-    """Connected surfaces in the mesh."""
+    """Number of connected surfaces in the mesh."""
     capped: bool
-    """True where the field is occupied up to the border of the box, so that the surface was closed there."""
+    """Whether the field is occupied at the border of the box, so that the surface was closed there."""
     seconds: float
     """Wall time."""
 
@@ -39,7 +41,7 @@ class Mesh:
         colors: [V, 3] uint8, sRGB.
         weights: [V, J] float32 skinning weights, rows sum to 1.
         normals: [V, 3] float32, unit length, outward.
-        stats: how the mesh was extracted, if it was.
+        stats: of the extraction of the mesh, if it was extracted.
     """
 
     vertices: np.ndarray
@@ -63,7 +65,8 @@ class Mesh:
                 continue
             array = np.ascontiguousarray(array, dtype=wanted)
             if len(array) != len(self.vertices) or array.ndim != 2 or (name != "weights" and array.shape[1] != 3):
-                raise ValueError(f"{name}: wanted a row for each of {len(self.vertices)} vertices, got {array.shape}")
+                columns = "J" if name == "weights" else 3
+                raise ValueError(f"{name}: wanted shape [{len(self.vertices)}, {columns}], got {list(array.shape)}")
             object.__setattr__(self, name, array)
 
     @property
@@ -71,13 +74,29 @@ class Mesh:
         """Lowest and highest corner of the box around the vertices, metres."""
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
+    @property
+    def skinning_weights(self) -> np.ndarray:
+        """[V, J] float32, the weights of a mesh that must have some.
+
+        Raises:
+            ValueError: the mesh has no weights.
+        """
+        if self.weights is None:
+            raise ValueError("weights: wanted a mesh with skinning weights, got one without")
+        return self.weights
+
+    @property
+    def unit_normals(self) -> np.ndarray:
+        """[V, 3] float32, the normals, computed if the mesh has none."""
+        return vertex_normals(self.vertices, self.faces) if self.normals is None else self.normals
+
     def with_normals(self) -> Mesh:
-        """Return the mesh with vertex normals, computed if there are none."""
-        return self if self.normals is not None else replace(self, normals=vertex_normals(self.vertices, self.faces))
+        """Return the mesh with vertex normals, computed if it has none."""
+        return self if self.normals is not None else replace(self, normals=self.unit_normals)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Average the face normals at each vertex, weighted by area.
+    """Return the mean of the face normals at each vertex, weighted by area.
 
     Args:
         vertices: [V, 3].
@@ -88,7 +107,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """
     corners = vertices.astype(np.float64)[faces]
     normals_f = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    # bincount: several times faster than np.add.at
+    # bincount is several times as fast as np.add.at
     index = faces.ravel()
     normals = np.stack(
         [np.bincount(index, np.repeat(normals_f[:, axis], 3), minlength=len(vertices)) for axis in range(3)], axis=1
@@ -99,10 +118,7 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def face_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
-    """Number the connected surfaces and return the number of each face, [F] int; the largest surface is 0."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
+    """Return the number of the connected surface of each face, [F] int; the largest surface is 0."""
     if not len(faces):
         return np.zeros(0, dtype=np.int64)
     start = faces.ravel()
@@ -116,15 +132,15 @@ def face_components(faces: np.ndarray, num_vertices: int) -> np.ndarray:
 
 
 def keep_components(vertices: np.ndarray, faces: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray, int, int]:
-    """Drop the connected surfaces that have fewer faces than `share` of the largest one's.
+    """Drop the connected surfaces with fewer faces than `share` of the largest one.
 
     Args:
         vertices: [V, 3].
         faces: [F, 3].
-        share: 0 keeps everything, 1 the largest only.
+        share: 0 keeps all surfaces, 1 only the largest.
 
     Returns:
-        vertices and faces left, number of surfaces found, number of surfaces kept.
+        The remaining vertices and faces, the number of surfaces found, and the number kept.
     """
     labels = face_components(faces, len(vertices))
     counts = np.bincount(labels)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ __all__ = ["MESH_WRITERS", "read_mesh", "write_mesh", "write_obj", "write_ply"]
 
 
 def write_ply(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh as binary little-endian PLY, with its normals and colours, whole or not at all."""
+    """Write a mesh with its normals and colours as binary little-endian PLY. The file is whole or absent."""
     columns: list[tuple[str, str, str, np.ndarray]] = []  # PLY type, name, numpy type, values
     groups = [("float", "<f4", ("x", "y", "z"), mesh.vertices), ("float", "<f4", ("nx", "ny", "nz"), mesh.normals)]
     groups.append(("uchar", "u1", ("red", "green", "blue"), mesh.colors))
@@ -39,9 +40,9 @@ def write_ply(path: str | Path, mesh: Mesh) -> None:
 
 
 def write_obj(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh as OBJ, whole or not at all.
+    """Write a mesh as OBJ. The file is whole or absent.
 
-    Colours follow the coordinates of a vertex as three numbers from 0 to 1, as Blender, MeshLab and trimesh read them.
+    Colours follow the coordinates of a vertex as three numbers from 0 to 1, which Blender, MeshLab and trimesh read.
     """
     vertices = mesh.vertices.astype(np.float64)
     text = io.StringIO()
@@ -61,17 +62,19 @@ def write_obj(path: str | Path, mesh: Mesh) -> None:
 
 
 MESH_WRITERS: dict[str, Callable[[str | Path, Mesh], None]] = {"ply": write_ply, "obj": write_obj}
+"""Writers of mesh files by suffix."""
 
 
 def write_mesh(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh in the format that the suffix of `path` names.
+    """Write a mesh in the format of the suffix of `path`.
 
     Raises:
-        UserError: there is no such format.
+        UserError: the format is unknown.
     """
     suffix = Path(path).suffix.lower().lstrip(".")
     if suffix not in MESH_WRITERS:
-        raise UserError(f"mesh {path}: wanted a name ending in {' or '.join('.' + s for s in MESH_WRITERS)}")
+        endings = " or ".join(f".{known}" for known in MESH_WRITERS)
+        raise UserError(f"mesh {path}: wanted a name ending in {endings}, got {Path(path).name!r}")
     MESH_WRITERS[suffix](path, mesh)
 
 
@@ -81,14 +84,15 @@ def read_mesh(path: str | Path) -> Mesh:
     Raises:
         UserError: the file is missing or is not a mesh.
     """
-    import trimesh
+    import trimesh  # here: loading it takes a second, and writing does not need it
 
     path = Path(path)
     if not path.is_file():
         raise UserError(f"no mesh at {path}")
     try:
         loaded = trimesh.load_mesh(path, process=False, maintain_order=True)
-        colors = loaded.visual.vertex_colors[:, :3] if loaded.visual.kind == "vertex" else None
+        visual: Any = loaded.visual  # its attributes depend on its kind
+        colors = visual.vertex_colors[:, :3] if visual.kind == "vertex" else None
         return Mesh(loaded.vertices, loaded.faces, colors=colors)
     except (ValueError, KeyError, IndexError, AttributeError, NotImplementedError) as error:
         raise UserError(f"mesh {path} cannot be read ({error}); make it again") from None

@@ -1,4 +1,4 @@
-"""The mesh of an avatar in one pose, of either kind of surface."""
+"""The mesh of an avatar in one pose, for both kinds of surfaces."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from snarfcli.models.trained_field import TrainedField
 __all__ = ["SURFACES", "posed_mesh"]
 
 SURFACES = ("field", "skinned")
-"""Kinds of surfaces: that of the posed field, and the canonical mesh moved by linear blend skinning."""
+"""Kinds of surfaces: the surface of the posed field, and the canonical mesh moved by linear blend skinning."""
 
 
 def posed_mesh(
@@ -26,7 +26,17 @@ def posed_mesh(
     keep_share: float = 0.01,
     transforms: Tensor | None = None,
 ) -> Mesh:
-    """Return the surface of the kind `surface`, see `SURFACES`; `weights_from` serves `field` only.
+    """Return the surface of kind `surface` in one pose; see `field_surface` for the arguments.
+
+    Args:
+        avatar: gives the field.
+        pose: [J, 3] axis-angle, radians, global orientation included.
+        translation: [3], metres.
+        resolution: voxels along the longest side.
+        surface: one of `SURFACES`.
+        weights_from: canonical mesh with weights, for `field` only.
+        keep_share: see `extract_surface`.
+        transforms: [J, 4, 4], canonical to posed, metres, instead of those of the pose.
 
     Raises:
         ValueError: `surface` is unknown.

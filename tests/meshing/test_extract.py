@@ -228,7 +228,7 @@ def test_no_surface_is_a_clear_error():
         ({"refine": -1}, "refine: wanted at least 0"),
         ({"dilate": -1}, "dilate: wanted at least 0"),
         ({"keep_share": 2.0}, "keep_share: wanted a share"),
-        ({"field": lambda p: p}, "field: wanted .* values"),
+        ({"field": lambda p: p}, "field: wanted shape .*one value per point"),
         ({"field": lambda p: p[:, 0] * torch.nan}, "got NaN at"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",

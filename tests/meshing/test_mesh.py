@@ -36,8 +36,8 @@ def test_components_are_numbered_by_size():
     [
         ({"vertices": np.zeros((3, 2))}, r"vertices: wanted shape \[n, 3\]"),
         ({"faces": np.array([[0, 1, 3]])}, "faces: wanted indices of 3 vertices, got 3"),
-        ({"colors": np.zeros((2, 3))}, "colors: wanted a row for each of 3 vertices"),
-        ({"normals": np.zeros((3, 4))}, "normals: wanted a row"),
+        ({"colors": np.zeros((2, 3))}, r"colors: wanted shape \[3, 3\], got \[2, 3\]"),
+        ({"normals": np.zeros((3, 4))}, r"normals: wanted shape \[3, 3\], got \[3, 4\]"),
     ],
 )
 def test_wrong_arrays_are_named(arguments, message):

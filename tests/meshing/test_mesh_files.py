@@ -60,7 +60,7 @@ def test_nothing_half_written(tmp_path, monkeypatch):
         write_obj(tmp_path / "mesh.obj", ball(True, True))
     broken = ball(False, False)
     object.__setattr__(broken, "faces", np.zeros((2, 5)))
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="could not broadcast"):
         write_ply(tmp_path / "mesh.ply", broken)
     assert not list(tmp_path.iterdir())
 

@@ -20,11 +20,11 @@ class PosedBody:
     """A body in B poses."""
 
     vertices: Tensor
-    """[B, V, 3] posed vertices, metres."""
+    """[B, V, 3], posed vertices, metres."""
     joints: Tensor
-    """[B, J, 3] posed joints, metres."""
+    """[B, J, 3], posed joints, metres."""
     posed_from_rest: Tensor
-    """[B, J, 4, 4] bone transforms from the shaped rest pose."""
+    """[B, J, 4, 4], bone transforms from the shaped rest pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +35,21 @@ class Body:
     """
 
     v_template: Tensor
-    """[V, 3] vertices of the mean shape in the rest pose."""
+    """[V, 3], vertices of the mean shape in the rest pose."""
     faces: Tensor
-    """[F, 3] int64 triangles, outward."""
+    """[F, 3], int64 triangles, outward."""
     weights: Tensor
-    """[V, J] linear blend skinning weights, rows sum to 1."""
+    """[V, J], linear blend skinning weights, rows sum to 1."""
     parents: tuple[int, ...]
     """J parents, -1 for the root; a parent comes before its children."""
     joint_names: tuple[str, ...]
     """J joint names."""
     joint_regressor: Tensor
-    """[J, V] joints of a shaped rest body from its vertices."""
+    """[J, V], joints of a shaped rest body from its vertices."""
     shapedirs: Tensor
-    """[V, 3, S] vertex offsets per unit of each shape parameter (beta)."""
+    """[V, 3, S], vertex offsets per unit of each shape parameter (beta)."""
     posedirs: Tensor
-    """[V, 3, 9 (J - 1)] vertex offsets per entry of R_j - I, j = 1 .. J - 1, row major; [V, 3, 0] without pose correctives."""
+    """[V, 3, 9 (J - 1)], vertex offsets per entry of R_j - I, j = 1 .. J - 1, row major; [V, 3, 0] without pose correctives."""
 
     @property
     def num_joints(self) -> int:
@@ -62,7 +62,7 @@ class Body:
         return self.shapedirs.shape[-1]
 
     def to(self, *args: Any, **kwargs: Any) -> Body:
-        """Move every floating tensor as `Tensor.to` does; `faces` only changes device."""
+        """Convert every floating tensor as `Tensor.to` does; `faces` only changes device."""
         moved = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)}
         moved = {name: value.to(*args, **kwargs) for name, value in moved.items()}
         moved["faces"] = self.faces.to(moved["weights"].device)
@@ -72,10 +72,11 @@ class Body:
         """Return the rest pose of one shape.
 
         Args:
-            betas: [S'] shape parameters, S' at most S; the mean shape without them.
+            betas: [S'], shape parameters, S' at most S; the mean shape without them.
 
         Returns:
-            v_shaped [V, 3] and joints_rest [J, 3], metres (SMPL Eq. 8 and 10).
+            v_shaped: [V, 3], vertices in the rest pose, metres (SMPL Eq. 8).
+            joints_rest: [J, 3], joints in the rest pose, metres (SMPL Eq. 10).
 
         Raises:
             ValueError: betas is not a vector, or is longer than the body has shape parameters.
@@ -97,12 +98,12 @@ class Body:
         """Pose the body (SMPL Eq. 2, 5 and 6): shape, pose correctives, linear blend skinning.
 
         Args:
-            pose: [B, J, 3] axis-angle, radians, global orientation included.
-            betas: [S'] shape parameters, the same in every pose; the mean shape without them.
-            translation: [B, 3] metres, none by default.
+            pose: [B, J, 3], axis-angle, radians, global orientation included.
+            betas: [S'], shape parameters, the same in every pose; the mean shape without them.
+            translation: [B, 3], metres, none by default.
 
         Returns:
-            Vertices, joints and bone transforms in the body's dtype and on its device.
+            Vertices, joints and bone transforms, with the dtype and device of the body.
 
         Raises:
             ValueError: a shape does not match; the message names the argument.

@@ -1,4 +1,4 @@
-"""The body that comes with the package."""
+"""The built-in body."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _FILE = Path(__file__).with_name("body_cc0.npz")
 
 @lru_cache(maxsize=2)
 def builtin_body(dtype: torch.dtype = torch.float32) -> Body:
-    """Return the body that comes with the package: 24 joints, 6890 vertices, closed surface, 10 shape parameters.
+    """Return the built-in body: 24 joints, 6890 vertices, closed surface, 10 shape parameters.
 
-    Derived only from MakeHuman's CC0 data by `tools/make_body.py`, and itself CC0-1.0. It has the numbers of vertices
-    and faces of SMPL's body, but it is not SMPL's mesh. Read once and shared: do not write into its tensors.
+    `tools/make_body.py` derived it from MakeHuman's CC0 data only; its licence is CC0-1.0. It has as many vertices and faces as
+    SMPL's body, but is not SMPL's mesh. It is read once and shared: do not modify its tensors.
     """
     return load_body(_FILE, dtype=dtype)

@@ -1,4 +1,4 @@
-"""Finding a body model under the names by which people download and rename it."""
+"""Find a body model file by its usual names: as downloaded, renamed or converted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GENDERS = ("female", "male", "neutral")
 _TITLES = {"smpl": "SMPL", "smplh": "SMPL-H", "smplx": "SMPL-X"}
 _LETTERS = {"f": "female", "m": "male", "n": "neutral"}
 _SUFFIX = r"\.(?P<suffix>npz|pkl)"
-# A word after the name says how a copy was made, for example `_2020`, `_np`, `_clean`, `_py3`; other words mean other files.
+# A word after the name marks a copy, for example `_2020`, `_np`, `_clean`, `_py3`; other words mean other files.
 _COPY = r"(?P<copy>(?:[_.-](?:\d+|v?\d+(?:\.\d+)+|np|clean|cleaned|py3|nochumpy|converted))*)"
 _DOWNLOADED = re.compile(
     r"basicmodel_(?P<gender>f|m|n|female|male|neutral)_lbs_10_207_0_v(?P<version>\d+\.\d+\.\d+)" + _COPY + _SUFFIX
@@ -32,8 +32,8 @@ _NAMES = {
     "smplh": "SMPLH_{GENDER}.pkl, smplh/{gender}/model.npz",
     "smplx": "SMPLX_{GENDER}.npz, smplx/{gender}/model.npz",
 }
-# Deeper than any release unpacks. The bounds keep a wrongly named place, such as /, from being searched for minutes; CAPE,
-# which lies beside the bodies, has some 150,000 files in some 600 folders.
+# Deeper than any release unpacks. The limits keep a wrong folder, such as /, from being searched for minutes; CAPE, which often
+# lies beside the bodies, has about 150,000 files in 600 folders.
 _MAX_DEPTH = 6
 _MAX_FOLDERS = 20_000
 _MAX_ENTRIES = 1_000_000
@@ -56,35 +56,35 @@ class _Found:
 
 
 def find_body(place: str | Path, kind: str | None, gender: str) -> Path:
-    """Find the body model of a gender.
+    """Find the body model file of a gender.
 
-    Of several files the first is taken in this order: SMPL, SMPL-H, SMPL-X (unless `kind` says which); the highest version in
-    the name; the name as downloaded before one marked as a copy; `.npz` before `.pkl`; the one less deep; alphabetically.
+    If there are several, the first in this order is returned: SMPL, SMPL-H, SMPL-X (unless `kind` is given); the highest
+    version in the name; the name as downloaded before a copy; `.npz` before `.pkl`; the less deep path; alphabetical order.
 
     Args:
-        place: a model file, which is taken as it is; or a folder, in which and below which (six levels) is searched for the
-            names of the releases, in upper or lower case: `basicmodel_f_lbs_10_207_0_v1.1.0.pkl`, `SMPL_FEMALE.pkl`,
-            `smplh/female/model.npz`, `SMPLX_FEMALE.npz` and conversions of them.
+        place: a model file, which is returned unchanged; or a folder, which is searched six levels deep for the names of the
+            releases, in upper or lower case: `basicmodel_f_lbs_10_207_0_v1.1.0.pkl`, `SMPL_FEMALE.pkl`,
+            `smplh/female/model.npz`, `SMPLX_FEMALE.npz`, and conversions of them.
         kind: smpl, smplh, smplx, or None for any.
         gender: female, male or neutral, in upper or lower case, or its first letter.
 
     Returns:
-        The file. It is never one of another gender.
+        The file, never that of another gender.
 
     Raises:
-        UserError: the place does not exist or holds no such model (the message says what was found), or the kind or gender is
-            none of these.
+        UserError: the place does not exist or has no such model (the message lists what was found), or the kind or gender is
+            unknown.
     """
     place = Path(place).expanduser()
     wanted = _LETTERS.get(gender.strip().lower()[:1], "")
     if not gender.strip() or not wanted.startswith(gender.strip().lower()):
-        raise UserError(f"body gender {gender!r:.40} is not known; wanted {', '.join(GENDERS)}")
+        raise UserError(f"body gender: wanted {', '.join(GENDERS)}, got {gender!r:.40}")
     if kind is not None and kind not in BODY_KINDS:
-        raise UserError(f"body kind {kind!r:.40} is not known; wanted {', '.join(BODY_KINDS)}")
+        raise UserError(f"body kind: wanted {', '.join(BODY_KINDS)}, got {kind!r:.40}")
     if place.is_file():
         return place
     if not place.is_dir():
-        raise UserError(f"no body model at {place}; name a model file or the folder with them")
+        raise UserError(f"no body model at {place}; name a model file or a folder of model files")
     found = sorted(_search(place), key=lambda one: one.preference)
     for one in found:
         if one.gender == wanted and kind in (None, one.kind):
@@ -94,8 +94,7 @@ def find_body(place: str | Path, kind: str | None, gender: str) -> Path:
     names = names.format(letter=wanted if wanted == "neutral" else wanted[0], gender=wanted, GENDER=wanted.upper())
     there = ", ".join(str(one.path.relative_to(place)) for one in found[:6]) + (", ..." if len(found) > 6 else "")
     raise UserError(
-        f"no {wanted} {title} model in {place}; looked for {names}, and found {there or 'no model at all'}; "
-        "download it, or name a model file"
+        f"no {wanted} {title} model in {place}; wanted {names}, got {there or 'no model'}; download it, or name a model file"
     )
 
 
@@ -115,7 +114,7 @@ def _search(place: Path) -> Iterator[_Found]:
 
 
 def _kind_of(folders: list[str]) -> str | None:
-    """Return which model the nearest folder is named after; `dmpls` holds soft tissue under the same file names."""
+    """Return the kind of model that the nearest folder is named after; folders `dmpl...` hold other data of the same names."""
     for folder in folders:
         if folder.startswith("dmpl"):
             return None
@@ -125,7 +124,7 @@ def _kind_of(folders: list[str]) -> str | None:
 
 
 def _files(place: Path) -> Iterator[tuple[Path, int]]:
-    """Yield the files in a folder and below, with their depth; links to folders are followed, but no folder is read twice."""
+    """Yield the model files below a folder with their depth; links to folders are followed, but no folder is read twice."""
     seen: set[str] = set()
     waiting = deque([(place, 0)])
     entries = 0
@@ -137,12 +136,12 @@ def _files(place: Path) -> Iterator[tuple[Path, int]]:
         seen.add(real)
         try:
             content = sorted(os.scandir(folder), key=lambda entry: entry.name)
-        except OSError:  # not ours to read
+        except OSError:  # no permission
             continue
         entries += len(content)
         if entries > _MAX_ENTRIES or len(seen) > _MAX_FOLDERS:
-            much = f"over {_MAX_ENTRIES:,} files or {_MAX_FOLDERS:,} folders"
-            raise UserError(f"folder {place} holds {much}; name the folder with the body models by body=FOLDER")
+            limits = f"at most {_MAX_ENTRIES:,} files and {_MAX_FOLDERS:,} folders"
+            raise UserError(f"folder {place}: wanted {limits}, got more; name the folder of the body models by body=FOLDER")
         for entry in content:
             if entry.name.lower().endswith((".npz", ".pkl")):
                 if entry.is_file():

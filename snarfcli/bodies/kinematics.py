@@ -16,24 +16,24 @@ __all__ = [
     "pose_from_transforms",
 ]
 
-# How far from a joint its frame is compared, metres: about the size of a hand, so that turns and scale show as lengths.
+# Distance from a joint at which frames are compared, metres: about the size of a hand; expresses rotation and scale as lengths.
 _REACH_M = 0.1
 
-# Matrices with M^T M this close to the identity are turned into rotations by iteration.
+# Matrices with M^T M this close to the identity are projected to rotations by iteration.
 _NEARLY_A_ROTATION = 0.05
 
-# Below this squared angle the series to t^8 is used: its first missing term, t^10 / 11!, is then under 3e-18.
+# Below this squared angle the series to t^8 is used; its first omitted term, t^10 / 11!, is under 3e-18.
 _SMALL_ANGLE_SQUARED = 1e-2
 
 
 def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
-    """Turn axis-angle vectors into rotation matrices (Rodrigues' formula), smoothly through zero.
+    """Convert axis-angle vectors to rotation matrices (Rodrigues' formula), smoothly through zero.
 
     Args:
-        axis_angle: [..., 3] rotation axis times angle, radians, float32 or float64.
+        axis_angle: [..., 3], rotation axis times angle, radians, float32 or float64.
 
     Returns:
-        [..., 3, 3] rotation matrices, same dtype and device; differentiable everywhere, at zero too.
+        [..., 3, 3], rotation matrices, same dtype and device; differentiable everywhere, also at zero.
 
     Raises:
         ValueError: the last dimension is not 3.
@@ -42,11 +42,11 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
         raise ValueError(f"axis_angle: wanted shape [..., 3], got {list(axis_angle.shape)}")
     squared = axis_angle.square().sum(-1)
     is_small = squared < _SMALL_ANGLE_SQUARED
-    # The branch not taken must stay finite too, or its gradient would be nan times zero.
+    # The branch that is not selected must stay finite too, or its gradient would be NaN times zero.
     angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
     s = squared
     sin_over = torch.where(is_small, 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72))), torch.sin(angle) / angle)
-    # (1 - cos t) / t^2 through the half angle, which loses no digits
+    # (1 - cos t) / t^2 by the half angle, which avoids cancellation
     half = torch.sin(angle / 2) / angle
     cos_over = torch.where(is_small, 0.5 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90)))), 2 * half * half)
     x, y, z = axis_angle.unbind(-1)
@@ -60,14 +60,14 @@ def axis_angle_to_matrix(axis_angle: Tensor) -> Tensor:
 
 
 def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
-    """Turn rotation matrices into axis-angle vectors of length at most pi.
+    """Convert rotation matrices to axis-angle vectors of length at most pi.
 
     Args:
-        matrix: [..., 3, 3] rotation matrices, float32 or float64.
+        matrix: [..., 3, 3], rotation matrices, float32 or float64.
 
     Returns:
-        [..., 3] axis times angle, radians. Accurate at 0 and at pi: the quaternion is built from its
-        largest component.
+        [..., 3], axis times angle, radians. Accurate at 0 and at pi, since the quaternion is computed from its largest
+        component.
 
     Raises:
         ValueError: the last two dimensions are not 3 x 3.
@@ -100,7 +100,7 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
 
 
 def invert_rigid(transform: Tensor) -> Tensor:
-    """Invert rigid transforms [..., 4, 4] exactly, by the transposed rotation."""
+    """Invert rigid transforms [..., 4, 4] exactly, with the transposed rotation."""
     rotation_t = transform[..., :3, :3].transpose(-1, -2)
     translation = -(rotation_t @ transform[..., :3, 3:])
     return torch.cat([torch.cat([rotation_t, translation], -1), transform[..., 3:, :]], -2)
@@ -112,15 +112,14 @@ def forward_kinematics(
     """Pose a joint tree.
 
     Args:
-        pose: [B, J, 3] rotation of each joint relative to its parent, axis-angle, radians; joint 0 is the
-            global orientation.
-        joints_rest: [J, 3] or [B, J, 3] joint positions in the rest pose, metres.
+        pose: [B, J, 3], rotation of each joint relative to its parent, axis-angle, radians; joint 0 is the global orientation.
+        joints_rest: [J, 3] or [B, J, 3], joint positions in the rest pose, metres.
         parents: J parents, -1 for the root; a parent comes before its children.
-        translation: [B, 3] added to every joint, metres; none by default: the root joint stands at
-            joints_rest[0] + translation.
+        translation: [B, 3], added to every joint, metres; none by default. The root joint is at joints_rest[0] + translation.
 
     Returns:
-        joints_posed [B, J, 3], and posed_from_rest [B, J, 4, 4], which moves a point of the rest pose with each bone.
+        joints_posed: [B, J, 3], posed joints, metres.
+        posed_from_rest: [B, J, 4, 4], transforms that move points of the rest pose with each bone, metres.
 
     Raises:
         ValueError: a shape does not match, or a parent does not come before its child.
@@ -155,13 +154,13 @@ def forward_kinematics(
 
 
 def nearest_rotation(matrix: Tensor) -> Tensor:
-    """Return the rotation matrices nearest to any matrices (least squares): without scale, shear and reflection.
+    """Return the nearest rotation matrices (least squares): scale, shear and reflection are removed.
 
     Args:
-        matrix: [..., 3, 3], float32 or float64, finite. Rotations come back as they are, up to rounding.
+        matrix: [..., 3, 3], float32 or float64, finite. Rotations are returned unchanged, up to rounding.
 
     Returns:
-        [..., 3, 3] rotation matrices; arbitrary ones where the matrix leaves the choice, as zero does.
+        [..., 3, 3], rotation matrices; arbitrary where the nearest one is not unique, as for zero.
     """
     eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
     error = (matrix.transpose(-1, -2) @ matrix - eye).abs().amax((-1, -2))
@@ -170,8 +169,8 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
     rotation = matrix.clone()
     polished = matrix[is_near & (error > 64 * torch.finfo(matrix.dtype).eps)]
     if len(polished):
-        # Newton's iteration for the polar factor: the error falls as 0.05, 2e-3, 3e-6, 5e-12, 0. Rotations kept as float32 take
-        # this way, a hundred times faster than the decomposition.
+        # Newton's iteration for the polar factor: the error falls as 0.05, 2e-3, 3e-6, 5e-12, 0. It serves rotations stored as
+        # float32, and is a hundred times faster than the decomposition.
         result = polished
         for _ in range(4):
             result = result @ (1.5 * eye - 0.5 * result.transpose(-1, -2) @ result)
@@ -184,18 +183,19 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
 
 
 def pose_from_transforms(posed_from_rest: Tensor, parents: Sequence[int], joints_rest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the poses that move a joint tree as given bone transforms do: the way back from `forward_kinematics`.
+    """Return the poses that reproduce given bone transforms: the inverse of `forward_kinematics`.
 
     Args:
-        posed_from_rest: [T, J, 4, 4] transforms that move a point of the rest pose with each bone, metres, float32 or float64.
-            Scale, shear and reflection are left out of the poses, and so are joints that come apart: see the residual.
+        posed_from_rest: [T, J, 4, 4], transforms that move a point of the rest pose with each bone, metres, float32 or float64.
+            Poses cannot express scale, shear, reflection and joints that come apart: see the residual.
         parents: J parents, -1 for the root; a parent comes before its children.
-        joints_rest: [J, 3] joint positions in the rest pose, metres.
+        joints_rest: [J, 3], joint positions in the rest pose, metres.
 
     Returns:
-        poses [T, J, 3] axis-angle, radians; translation [T, 3] metres; and the residual [T], metres: how far the poses are from
-        reproducing the transforms. It is the largest distance between where the transforms and where the poses put the
-        joints and the points 0.1 m from them along the axes. Rounding leaves about 1e-6 of it in float32.
+        poses: [T, J, 3], axis-angle, radians.
+        translation: [T, 3], metres.
+        residual: [T], difference between the transforms and those of the poses, metres: the largest distance between their
+            images of the joints and of the points 0.1 m from the joints along the axes. Rounding causes about 1e-6 in float32.
 
     Raises:
         ValueError: a shape does not match, a number is not finite, or a parent does not come before its child.
@@ -217,11 +217,11 @@ def pose_from_transforms(posed_from_rest: Tensor, parents: Sequence[int], joints
     again = forward_kinematics(poses, rest, parents, translation)[1]
     reach = torch.cat([torch.zeros(1, 3), _REACH_M * torch.eye(3)]).to(rest)
     error = posed_from_rest - again
-    # [T, J, 4, 3]: what both make of the joint and of the three points beside it
+    # [T, J, 4, 3]: differences at the joint and at the three points beside it
     apart = (error[..., None, :3, :3] @ (rest[:, None] + reach)[..., None]).squeeze(-1) + error[..., None, :3, 3]
     return poses, translation, apart.norm(dim=-1).amax((1, 2))
 
 
 def _check_parents(parents: Sequence[int]) -> None:
     if any(not -1 <= parent < joint for joint, parent in enumerate(parents)) or parents[0] != -1:
-        raise ValueError("parents: every parent must come before its child, and joint 0 must be the root (-1)")
+        raise ValueError("parents: wanted every parent before its child, and joint 0 as the root (-1)")

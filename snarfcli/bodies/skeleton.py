@@ -1,4 +1,4 @@
-"""The joint tree of one subject, and the pose in which its avatar is learned."""
+"""The joint tree of a subject, and the canonical pose of its avatar."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ _FINGER_JOINT_NAMES = tuple(
     for finger in ("index", "middle", "pinky", "ring", "thumb")
     for number in (1, 2, 3)
 )
-# Both have SMPL's joints up to the wrists.
+# SMPL-H and SMPL-X have the joints of SMPL up to the wrists.
 SMPLH_JOINT_NAMES = (*SMPL_JOINT_NAMES[:22], *_FINGER_JOINT_NAMES)
 SMPLX_JOINT_NAMES = (*SMPL_JOINT_NAMES[:22], "jaw", "l_eye", "r_eye", *_FINGER_JOINT_NAMES)
 
 CANONICAL_HIP_RAD = torch.pi / 6
-"""How far each leg is turned outwards in the canonical pose (SNARF's released code: 30 degrees)."""
+"""Outward rotation of each leg in the canonical pose (SNARF's released code: 30 degrees)."""
 
 
 def legs_apart_pose(names: tuple[str, ...], dtype: torch.dtype = torch.float32) -> Tensor:
-    """Return the pose [J, 3] that spreads the legs of a T-posed body (y up, facing +z); zero without hips.
+    """Return the pose [J, 3], axis-angle, radians, that spreads the legs of a T-posed body; zero if there are no hips.
 
-    Apart, the legs share no neighbourhood, so that skinning weights learned on one do not bleed into the other.
+    The body has y up and faces +z. With the legs apart, skinning weights learned on one leg do not affect the other.
     """
     pose = torch.zeros(len(names), 3, dtype=dtype)
-    for name, sign in (("l_hip", 1.0), ("r_hip", -1.0)):  # left is +x: turning about +z moves a hanging leg towards +x
+    for name, sign in (("l_hip", 1.0), ("r_hip", -1.0)):  # left is +x: rotation about +z moves a hanging leg towards +x
         if name in names:
             pose[names.index(name), 2] = sign * CANONICAL_HIP_RAD
     return pose
@@ -50,13 +50,13 @@ class Skeleton:
     """A joint tree with its rest joints and its canonical pose."""
 
     names: tuple[str, ...]
-    """J joint names, left and right ones starting with `l_` and `r_`."""
+    """J joint names; those of the left and right side start with `l_` and `r_`."""
     parents: tuple[int, ...]
     """J parents, -1 for the root; a parent comes before its children."""
     joints_rest: Tensor
-    """[J, 3] joint positions in the rest pose, metres."""
+    """[J, 3], joint positions in the rest pose, metres."""
     canonical_pose: Tensor
-    """[J, 3] pose of the canonical frame relative to the rest pose, axis-angle, radians."""
+    """[J, 3], pose of the canonical frame relative to the rest pose, axis-angle, radians."""
 
     def __post_init__(self) -> None:
         joints = len(self.parents)
@@ -73,44 +73,44 @@ class Skeleton:
 
     @property
     def bones(self) -> list[tuple[int, int]]:
-        """Pairs (parent, child) of joints, one for each joint but the root."""
+        """Pairs (parent, child) of joints, one per joint except the root."""
         return [(parent, joint) for joint, parent in enumerate(self.parents) if parent >= 0]
 
     @property
     def left_right(self) -> tuple[int, ...]:
-        """For each joint the one on the other side; a joint without a counterpart maps to itself."""
+        """Per joint, the index of its counterpart on the other side; its own index if there is none."""
         other = {"l": "r_", "r": "l_"}
         mirrored = (other[name[0]] + name[2:] if name[:2] in ("l_", "r_") else name for name in self.names)
         return tuple(self.names.index(m) if m in self.names else j for j, m in enumerate(mirrored))
 
     @property
     def canonical_joints(self) -> Tensor:
-        """[J, 3] joint positions in the canonical frame, metres."""
+        """[J, 3], joint positions in the canonical frame, metres."""
         return forward_kinematics(self.canonical_pose[None], self.joints_rest, self.parents)[0][0]
 
     def posed_from_rest(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
-        """Return the bone transforms [B, J, 4, 4] from the rest pose to `pose` [B, J, 3]."""
+        """Return the bone transforms [B, J, 4, 4] from the rest pose to `pose` [B, J, 3], axis-angle, radians."""
         return forward_kinematics(pose, self.joints_rest.to(pose), self.parents, translation)[1]
 
     def posed_from_canonical(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
         """Return the bone transforms from the canonical frame to a pose (SNARF's B_j, Eq. 4).
 
         Args:
-            pose: [B, J, 3] axis-angle, radians, global orientation included; the result has its dtype and device.
-            translation: [B, 3] metres, none by default.
+            pose: [B, J, 3], axis-angle, radians, global orientation included; the result has its dtype and device.
+            translation: [B, 3], metres, none by default.
 
         Returns:
-            [B, J, 4, 4] rigid transforms, metres.
+            [B, J, 4, 4], rigid transforms, metres.
         """
         canonical_from_rest = self.posed_from_rest(self.canonical_pose[None].to(pose))
         return self.posed_from_rest(pose, translation) @ invert_rigid(canonical_from_rest)
 
     def to(self, *args: Any, **kwargs: Any) -> Skeleton:
-        """Move both tensors as `Tensor.to` does."""
+        """Convert both tensors as `Tensor.to` does."""
         return Skeleton(self.names, self.parents, self.joints_rest.to(*args, **kwargs), self.canonical_pose.to(*args, **kwargs))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain lists and tensors, which `torch.load(weights_only=True)` reads back."""
+        """Return the content as plain lists and tensors, which `torch.load(weights_only=True)` accepts."""
         return {
             "names": list(self.names),
             "parents": list(self.parents),
@@ -120,7 +120,7 @@ class Skeleton:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Skeleton:
-        """Make the skeleton that `to_dict` described; arrays and lists are read too."""
+        """Return the skeleton of a dictionary from `to_dict`; arrays and lists are accepted in place of tensors."""
         return cls(
             names=tuple(str(name) for name in content["names"]),
             parents=tuple(int(parent) for parent in content["parents"]),

@@ -82,7 +82,10 @@ def test_gradients_reach_pose_and_shape(body):
     pose = torch.zeros(1, 24, 3, dtype=torch.float64, requires_grad=True)
     betas = torch.zeros(10, dtype=torch.float64, requires_grad=True)
     weight = torch.randn(6890, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    loss = lambda p, b: (body.pose(p, b).vertices * weight).sum()
+
+    def loss(p, b):
+        return (body.pose(p, b).vertices * weight).sum()
+
     loss(pose, betas).backward()
     for tensor, index in ((pose, (0, 18, 1)), (pose, (0, 0, 2)), (betas, (0,))):
         step = torch.zeros_like(tensor)

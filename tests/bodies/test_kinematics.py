@@ -118,7 +118,7 @@ def test_rigid_inverse():
             lambda: forward_kinematics(torch.zeros(1, 2, 3), torch.zeros(2, 3), (-1, 0), torch.zeros(3)),
             r"translation: wanted shape \[1, 3\], got \[3\]",
         ),
-        (lambda: forward_kinematics(torch.zeros(1, 2, 3), torch.zeros(2, 3), (1, -1)), "parents: every parent"),
+        (lambda: forward_kinematics(torch.zeros(1, 2, 3), torch.zeros(2, 3), (1, -1)), "parents: wanted every parent"),
     ],
 )
 def test_wrong_arguments(call, message):

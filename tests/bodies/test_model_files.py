@@ -36,7 +36,8 @@ def test_smpl_is_the_same_from_every_file(tmp_path):
     for name, path in files.items():
         body = load_body(path, dtype=torch.float64)
         assert torch.equal(posed(body), expected), name
-        assert body.joint_names[4] == "l_knee" and body.num_betas == (300 if "1.1" in path.name else 10), name
+        assert body.joint_names[4] == "l_knee", name
+        assert body.num_betas == (300 if "1.1" in path.name else 10), name
         assert all(tensor.is_contiguous() for tensor in (body.weights, body.shapedirs, body.posedirs, body.v_template))
     few = load_body(files["v1.1.0"], num_betas=16)
     assert few.num_betas == 16
@@ -172,24 +173,24 @@ def test_files_agree_with_smplx(tmp_path):
     ("change", "message"),
     [
         ({"shapedirs": None, "f": None}, "lacks f, shapedirs"),
-        ({"weights": np.zeros((5, 2), np.float32)}, r"weights has shape \[5, 2\], wanted \[6, 2\]"),
-        ({"weights": np.zeros(6, np.float32)}, r"weights has shape \[6\], wanted \[V, J\]"),
-        ({"weights": np.full((6, 2), 0.6)}, "weights of a vertex must sum to 1, and one is off by 0.2"),
-        ({"posedirs": np.zeros((6, 3, 10), np.float32)}, r"posedirs has shape \[6, 3, 10\], wanted \[6, 3, 9\]"),
-        ({"shapedirs": np.zeros((6, 3))}, r"shapedirs has shape \[6, 3\], wanted \[6, 3, S\]"),
-        ({"v_template": np.full((6, 3), np.nan)}, "v_template must hold finite numbers"),
-        ({"posedirs": np.full((6, 3, 9), 1e300)}, "posedirs must hold finite numbers"),
-        ({"weights": np.array("x")}, "weights must hold finite numbers"),
-        ({"f": np.full((8, 3), 6)}, "vertex numbers from 0 to 5"),
-        ({"f": np.full((8, 3), -1)}, "vertex numbers from 0 to 5"),
-        ({"f": np.full((8, 3), 0.5)}, "vertex numbers from 0 to 5"),
-        ({"f": np.zeros((0, 3), int)}, "vertex numbers from 0 to 5"),
-        ({"f": np.zeros((8, 4), int)}, r"f has shape \[8, 4\], wanted \[8, 3\]"),
-        ({"kintree_table": np.array([[1, -1], [0, 1]])}, r"names 1 as parent of joint 0, which must be the root \(-1\)"),
-        ({"kintree_table": np.array([[-1, 1], [0, 1]])}, "names 1 as parent of joint 1, which does not come before it"),
-        ({"kintree_table": np.array([[-1, 7], [0, 1]])}, "names 7 as parent of joint 1, which does not exist"),
-        ({"kintree_table": np.array([[-1, np.nan], [0, 1]])}, "must hold joint numbers"),
-        ({"v_template": np.array(1.0)}, "v_template has shape"),
+        ({"weights": np.zeros((5, 2), np.float32)}, r"weights: wanted shape \[6, 2\], got \[5, 2\]"),
+        ({"weights": np.zeros(6, np.float32)}, r"weights: wanted shape \[V, J\], got \[6\]"),
+        ({"weights": np.full((6, 2), 0.6)}, "weights: wanted rows that sum to 1, got an error of 0.2"),
+        ({"posedirs": np.zeros((6, 3, 10), np.float32)}, r"posedirs: wanted shape \[6, 3, 9\], got \[6, 3, 10\]"),
+        ({"shapedirs": np.zeros((6, 3))}, r"shapedirs: wanted shape \[6, 3, S\], got \[6, 3\]"),
+        ({"v_template": np.full((6, 3), np.nan)}, "v_template: wanted finite numbers"),
+        ({"posedirs": np.full((6, 3, 9), 1e300)}, "posedirs: wanted finite numbers"),
+        ({"weights": np.array("x")}, "weights: wanted finite numbers"),
+        ({"f": np.full((8, 3), 6)}, "vertex indices from 0 to 5"),
+        ({"f": np.full((8, 3), -1)}, "vertex indices from 0 to 5"),
+        ({"f": np.full((8, 3), 0.5)}, "vertex indices from 0 to 5"),
+        ({"f": np.zeros((0, 3), int)}, "vertex indices from 0 to 5"),
+        ({"f": np.zeros((8, 4), int)}, r"f: wanted shape \[8, 3\], got \[8, 4\]"),
+        ({"kintree_table": np.array([[1, -1], [0, 1]])}, r"wanted -1 \(root\) as parent of joint 0, got 1"),
+        ({"kintree_table": np.array([[-1, 1], [0, 1]])}, "parent of joint 1 is 1, which does not come before it"),
+        ({"kintree_table": np.array([[-1, 7], [0, 1]])}, "parent of joint 1 is 7, which does not exist"),
+        ({"kintree_table": np.array([[-1, np.nan], [0, 1]])}, "wanted indices of joints"),
+        ({"v_template": np.array(1.0)}, "v_template: wanted shape"),
     ],
 )
 def test_broken_files(tmp_path, change, message):
@@ -205,7 +206,7 @@ def test_broken_files(tmp_path, change, message):
 def test_a_cycle_of_joints(tmp_path):
     arrays = toy(5, 10)
     arrays["kintree_table"][0] = [-1, 0, 3, 2, 0]
-    with pytest.raises(UserError, match="names 3 as parent of joint 2, which does not come before it"):
+    with pytest.raises(UserError, match="parent of joint 2 is 3, which does not come before it"):
         load_body(write_npz(tmp_path / "body.npz", arrays))
 
 
@@ -214,7 +215,7 @@ def test_a_sparse_regressor_of_another_size_is_not_unfolded(tmp_path):
 
     for shape in ((2, 2**31 - 1), (2**31 - 1, 6)):
         huge = (scipy.sparse.csr_matrix if shape[0] == 2 else scipy.sparse.csc_matrix)(shape)
-        with pytest.raises(UserError, match=r"J_regressor has shape \[.*2147483647.*\], wanted \[2, 6\]"):
+        with pytest.raises(UserError, match=r"J_regressor: wanted shape \[2, 6\], got \[.*2147483647.*\]"):
             load_body(write_pickle(tmp_path / "body.pkl", {**octahedron(), "J_regressor": huge}))
 
 
@@ -227,9 +228,9 @@ def test_missing_and_foreign_files(tmp_path):
     with pytest.raises(UserError, match="is not a pickle"):
         load_body(tmp_path / "model.pkl")
     (tmp_path / "list.pkl").write_bytes(b"]K\x01a.")
-    with pytest.raises(UserError, match="holds a list; wanted named arrays"):
+    with pytest.raises(UserError, match=r"wanted named arrays \(.*\), got a list"):
         load_body(tmp_path / "list.pkl")
-    with pytest.raises(UserError, match=r"is neither an .npz nor a .pkl file"):
+    with pytest.raises(UserError, match=r"wanted an .npz or .pkl file"):
         load_body(tmp_path / "body.obj")
     (tmp_path / "evil.pkl").write_bytes(pickled(octahedron()).replace(b"cchumpy.ch\nCh\n", b"cposix\nsystem\n"))
     with pytest.raises(UserError, match=r"asks for posix.system, which plain data does not need"):

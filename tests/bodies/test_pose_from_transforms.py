@@ -92,7 +92,7 @@ def test_nearest_rotation():
         ({"transforms": torch.zeros(2, 6, 3, 4)}, r"posed_from_rest: wanted shape \[T, 6, 4, 4\], got \[2, 6, 3, 4\]"),
         ({"transforms": torch.full((2, 6, 4, 4), torch.nan)}, "posed_from_rest: wanted finite numbers"),
         ({"rest": torch.zeros(5, 3)}, r"joints_rest: wanted shape \[6, 3\], got \[5, 3\]"),
-        ({"parents": (1, -1, 1, 1, 3, 0)}, "parents: every parent"),
+        ({"parents": (1, -1, 1, 1, 3, 0)}, "parents: wanted every parent"),
     ],
 )
 def test_wrong_arguments(change, message):

@@ -1,4 +1,4 @@
-"""Reading untrusted files safely, and writing files that appear whole or not at all."""
+"""Reading of untrusted files without risk, and writing of files that appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -22,13 +22,13 @@ from snarfcli.errors import UserError, one_line
 __all__ = ["MAX_ARRAY_BYTES", "atomic_path", "file_digest", "read_json", "read_npy", "read_npz", "write_json", "write_tensors"]
 
 MAX_ARRAY_BYTES = 2**30
-"""What the arrays of one file may take, unless a reader says otherwise."""
-# Deflate packs at most about 1030 to 1. Arrays of zeros, such as unused hands, come close to it, but no large file as a whole.
+"""Maximum total size of the arrays in one file, unless a reader sets another."""
+# Deflate compresses at most about 1030 to 1. Arrays of zeros, such as unused hands, come close, but no large file as a whole.
 _BOMB_BYTES = 2**26
 _BOMB_RATIO = 500
-_LONGEST_HEADER = 2**16
-_MOST_JSON_BYTES = 2**25  # parsed they take some 600 MiB
-# The header is a Python dict of three entries; a type that is no word stands for records.
+_MAX_HEADER_BYTES = 2**16
+_MAX_JSON_BYTES = 2**25  # about 600 MiB when parsed
+# The header is a Python dict with three entries; records have a list instead of a word as type.
 _HEADER = (r"'descr':\s*'([^']*)'", r"'fortran_order':\s*(True|False)", r"'shape':\s*\(([\d\sL,]*)\)")
 
 
@@ -43,12 +43,12 @@ def file_digest(path: Path) -> str:
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` that replaces it when the block succeeds and vanishes when it fails.
+    """Yield a temporary path in the folder of `path`; it replaces `path` if the block succeeds and is deleted if it fails.
 
-    Parent folders are made. The temporary name keeps the suffix, since many writers choose the format by it.
+    Parent folders are created. The temporary name keeps the suffix, by which many writers choose the format.
 
     Raises:
-        OSError: the file cannot be written; it names `path`, which the system does not do for a full disk.
+        OSError: the file cannot be written. It names `path`, also for a full disk, where the system names no file.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -65,18 +65,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write `content` as indented JSON, whole or not at all."""
+    """Write `content` as indented JSON, complete or not at all."""
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def write_tensors(path: str | Path, content: Any) -> None:
-    """Write `content` by `torch.save`, whole or not at all.
+    """Write `content` with `torch.save`, complete or not at all.
 
     Raises:
-        OSError: the file cannot be written. (`torch.save` by itself reports a full disk as a RuntimeError without a reason.)
+        OSError: the file cannot be written. (For a full disk `torch.save` alone raises a RuntimeError without a reason.)
     """
-    import torch
+    import torch  # takes seconds, which reading needs not
 
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -88,12 +88,12 @@ def read_json(path: str | Path, what: str = "file") -> Any:
     """Read a JSON file.
 
     Raises:
-        UserError: the file is missing, is not JSON or is absurdly large.
+        UserError: the file is missing, is not JSON or is larger than 32 MiB.
     """
     path = Path(path)
     _check_regular(path, what, "a")
-    if path.stat().st_size > _MOST_JSON_BYTES:
-        raise UserError(f"{what} {path} has over {_MOST_JSON_BYTES // 2**20} MiB, too much for one; name another file")
+    if path.stat().st_size > _MAX_JSON_BYTES:
+        raise UserError(f"{what} {path} is larger than {_MAX_JSON_BYTES // 2**20} MiB; name another file")
     try:
         return json.loads(path.read_text())
     except ValueError as error:  # bad UTF-8, bad JSON, a number of over 4300 digits
@@ -105,19 +105,19 @@ def read_json(path: str | Path, what: str = "file") -> Any:
 def read_npz(
     path: str | Path, what: str = "file", *, only: Collection[str] | None = None, max_bytes: int = MAX_ARRAY_BYTES
 ) -> dict[str, np.ndarray]:
-    """Read the arrays of an `.npz` file without ever unpickling anything; members that are no arrays are left out.
+    """Read the arrays of an `.npz` file. Nothing is unpickled; members that are not arrays are left out.
 
-    Sizes are checked before anything is unpacked, so a file that unpacks to more than it may costs nothing.
+    Sizes are checked before anything is unpacked.
 
     Args:
         path: file.
-        what: what it is, for messages.
-        only: names of the arrays to read; without them all. What is not read may hold anything.
-        max_bytes: what the arrays may take together.
+        what: the kind of file, for messages.
+        only: names of the arrays to read, or None for all. Members that are not read are not checked.
+        max_bytes: maximum total size of the arrays.
 
     Raises:
-        UserError: the file is missing, cannot be opened, is not a zip archive, is truncated, damaged, encrypted, too large or
-            packed beyond reason; an array is there twice, holds pickled objects or records.
+        UserError: the file is missing, cannot be opened, is not a zip archive, is truncated, damaged, encrypted, too large or a
+            zip bomb; an array occurs twice, or holds pickled objects or records.
     """
     path = Path(path)
     _check_regular(path, what, "an .npz")
@@ -130,19 +130,19 @@ def read_npz(
                 arrays = {}
                 for name, member in members.items():
                     with archive.open(member) as stream:
-                        array = _read_array(stream, member.file_size, f"{what} {path}: {name!r:.60}")
+                        array = _read_array(cast(io.BufferedIOBase, stream), member.file_size, f"{what} {path}: {name!r:.60}")
                     if array is not None:
                         arrays[name] = array
                 return arrays
     except UserError:
         raise
-    except Exception as error:  # zipfile lets many kinds through; tests/fuzz_targets.py found over ten
+    except Exception as error:  # zipfile raises many kinds; tests/fuzz_targets.py found over ten
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise UserError(f"{what} {path} is damaged ({one_line(reason, 200)}); copy or download it again") from None
 
 
 def read_npy(path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY_BYTES) -> np.ndarray:
-    """Read the array of an `.npy` file without ever unpickling anything; the size is checked first.
+    """Read the array of an `.npy` file. Nothing is unpickled; the size is checked first.
 
     Raises:
         UserError: the file is missing, cannot be opened, is not an `.npy` file, is truncated, too large, or holds pickled
@@ -153,7 +153,7 @@ def read_npy(path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY
     try:
         size = path.stat().st_size
         if size > max_bytes:
-            raise UserError(f"{what} {path} has {size / 2**20:,.0f} MiB, more than {max_bytes / 2**20:,.0f}; cut it into parts")
+            raise UserError(f"{what} {path} has {size / 2**20:,.0f} MiB, wanted at most {max_bytes / 2**20:,.0f}; split it")
         with path.open("rb") as file:
             array = _read_array(file, size, f"{what} {path}")
     except OSError as error:
@@ -164,43 +164,45 @@ def read_npy(path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY
 
 
 def _check_regular(path: Path, what: str, kind: str) -> None:
-    """Refuse what is missing or is no file, such as a folder or a pipe, which would be waited for."""
+    """Check that a path is a regular file. (A pipe would block.)"""
     if path.is_dir():
         raise UserError(f"{what} {path} is a folder; name {kind} file")
     if not path.exists():
         raise UserError(f"no {what} at {path}")
     if not path.is_file():
-        raise UserError(f"{what} {path} is no regular file; name {kind} file")
+        raise UserError(f"{what} {path} is not a regular file; name {kind} file")
 
 
 def _members(
     archive: zipfile.ZipFile, subject: str, only: Collection[str] | None, max_bytes: int
 ) -> dict[str, zipfile.ZipInfo]:
-    """Return the members to read by name, once their sizes and kinds are known to be sane."""
+    """Return the members to read by name, after checks of their sizes and compression."""
     members: dict[str, zipfile.ZipInfo] = {}
     for member in archive.infolist():
         name = member.filename.removesuffix(".npy")
         if member.is_dir() or (only is not None and name not in only):
             continue
         if name in members:
-            raise UserError(f"{subject} holds {name!r:.60} twice; save it again")
+            raise UserError(f"{subject} contains {name!r:.60} twice; save it again")
         if member.flag_bits & 1:
             raise UserError(f"{subject} is damaged or encrypted; copy or download it again")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise UserError(f"{subject} is packed in a way that is not read; save it again with numpy.savez_compressed")
+            raise UserError(f"{subject} uses an unsupported compression; save it again with numpy.savez_compressed")
         members[name] = member
     total, packed = (sum(getattr(member, size) for member in members.values()) for size in ("file_size", "compress_size"))
     if total > max_bytes:
-        raise UserError(f"{subject} unpacks to {total / 2**20:,.0f} MiB, more than {max_bytes / 2**20:,.0f}; cut it into parts")
+        raise UserError(f"{subject} unpacks to {total / 2**20:,.0f} MiB, wanted at most {max_bytes / 2**20:,.0f}; split it")
     if total > _BOMB_BYTES and total > _BOMB_RATIO * packed:
-        raise UserError(f"{subject} unpacks to {total / 2**20:,.0f} MiB from {packed / 2**10:,.0f} KiB, which no data does")
+        raise UserError(
+            f"{subject} unpacks to {total / 2**20:,.0f} MiB from {packed / 2**10:,.0f} KiB, which no real data does"
+        )
     return members
 
 
-def _read_array(stream: IO[bytes], size: int, subject: str) -> np.ndarray | None:
-    """Read one array in NumPy's own format, of `size` bytes in all; None if it is something else.
+def _read_array(stream: io.BufferedIOBase, size: int, subject: str) -> np.ndarray | None:
+    """Read one array in NumPy's `.npy` format, `size` bytes in total; return None for another format.
 
-    NumPy's reader would believe any length that the header declares, and evaluates the header as Python.
+    NumPy's own reader trusts any length in the header, and evaluates the header as Python.
     """
     damaged = UserError(f"{subject} is damaged; copy or download the file again")
     magic = stream.read(8)
@@ -210,18 +212,18 @@ def _read_array(stream: IO[bytes], size: int, subject: str) -> np.ndarray | None
         raise damaged
     width = 2 if magic[6] == 1 else 4
     length = int.from_bytes(stream.read(width), "little")
-    if length > min(_LONGEST_HEADER, size):
+    if length > min(_MAX_HEADER_BYTES, size):
         raise damaged
     header = stream.read(length).decode("latin1")
-    found = [re.search(pattern, header) for pattern in _HEADER]
-    if not all(found):
+    found = [match for pattern in _HEADER if (match := re.search(pattern, header))]
+    if len(found) < len(_HEADER):
         if "'descr': [" in header:
             raise UserError(f"{subject} holds records; save plain arrays")
         raise damaged
     descr, order, shape = (match[1] for match in found)
     try:
         dtype = np.dtype(descr)
-    except Exception:  # whatever NumPy makes of a word that is no type
+    except Exception:  # NumPy raises several kinds for a word that is not a type
         raise damaged from None
     if dtype.hasobject:
         raise UserError(f"{subject} holds pickled objects, which are never executed; save plain arrays")
@@ -239,10 +241,10 @@ def _read_array(stream: IO[bytes], size: int, subject: str) -> np.ndarray | None
         if not got:
             raise damaged
         filled += got
-    if stream.read(1):  # at the end the archive compares checksums
+    if stream.read(1):  # at the end of a member, zipfile compares the checksum
         raise damaged
     try:
         flat = np.frombuffer(content, dtype, count) if content else np.zeros(count, dtype)
         return flat.reshape(lengths, order="F" if order == "True" else "C")
-    except (ValueError, TypeError):  # too many dimensions, say
+    except (ValueError, TypeError):  # such as too many dimensions
         raise damaged from None

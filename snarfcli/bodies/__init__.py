@@ -12,6 +12,7 @@ from snarfcli.bodies.kinematics import (
 )
 from snarfcli.bodies.model_files import load_body
 from snarfcli.bodies.skeleton import SMPL_JOINT_NAMES, SMPLH_JOINT_NAMES, SMPLX_JOINT_NAMES, Skeleton, legs_apart_pose
+from snarfcli.bodies.template import MeshTemplate
 
 __all__ = [
     "BODY_KINDS",
@@ -20,6 +21,7 @@ __all__ = [
     "SMPLX_JOINT_NAMES",
     "SMPL_JOINT_NAMES",
     "Body",
+    "MeshTemplate",
     "PosedBody",
     "Skeleton",
     "axis_angle_to_matrix",

@@ -13,6 +13,7 @@ import torch
 from omegaconf import MISSING, OmegaConf
 
 from snarfcli.avatar import Avatar
+from snarfcli.bodies import MeshTemplate
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.deformer_checks import check_search, check_skinning
 from snarfcli.datasets.builtin import check_subject
@@ -25,7 +26,6 @@ from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.start_bones import with_start_bones
-from snarfcli.models.system import MeshTemplate
 from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
@@ -229,8 +229,7 @@ def _template(model: str, store: SampleStore) -> MeshTemplate | None:
             f"model={model} needs the subject's mesh with its true skinning weights, which the samples of {store.data} "
             f"{store.subject} do not hold; choose another model, or data made with a body model or a rig"
         )
-    parts = (store.template.vertices, store.template.weights)
-    return MeshTemplate(*(torch.as_tensor(part, dtype=torch.float32) for part in parts))
+    return store.template
 
 
 def _write_config(folder: Path, config: TrainConfig) -> None:

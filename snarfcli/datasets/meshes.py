@@ -29,6 +29,7 @@ import torch
 from numpy.typing import NDArray
 
 from snarfcli.bodies.skeleton import Skeleton, legs_apart_pose
+from snarfcli.bodies.template import MeshTemplate
 from snarfcli.checks import check_choice
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
 from snarfcli.datasets.recorded_sequence import Recording, World, person_scale
@@ -37,7 +38,7 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.skeleton_files import SkeletonFile, read_poses, read_skeleton
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import split_sequences
-from snarfcli.datasets.subjects import SubjectData, Template
+from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
 from snarfcli.formats.surfaces import list_surfaces, read_surface
@@ -234,11 +235,11 @@ def _load_rigged(subject: str, place: Path, paths: list[Path], config: DataConfi
     return _subject(subject, skeleton, world, recordings, place, config, tuple(sources), template=make)
 
 
-def _template(vertices: NDArray, faces: NDArray, weights: NDArray, skeleton: Skeleton) -> Template:
+def _template(vertices: NDArray, faces: NDArray, weights: NDArray, skeleton: Skeleton) -> MeshTemplate:
     """Return the mesh in the canonical pose."""
     moved = skeleton.posed_from_rest(skeleton.canonical_pose[None]).numpy()
     canonical, _ = RigMeshes(vertices, faces, weights, moved)[0]
-    return Template(canonical, faces.astype(np.int32), weights)
+    return MeshTemplate(canonical, faces.astype(np.int32), weights)
 
 
 # ---------------------------------------------------------------- both
@@ -251,7 +252,7 @@ def _subject(
     config: DataConfig,
     sources: tuple[str, ...],
     *,
-    template: Callable[[Skeleton], Template] | None = None,
+    template: Callable[[Skeleton], MeshTemplate] | None = None,
     broken: tuple[tuple[str, str], ...] = (),
 ) -> SubjectData:
     """Split the recordings and bring everything into the world."""

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from snarfcli.bodies import Skeleton
+from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.datasets.posed_meshes import RigMeshes
 from snarfcli.datasets.sources import Request
-from snarfcli.datasets.subjects import SequenceSpec, Split, SubjectData, Template
+from snarfcli.datasets.subjects import SequenceSpec, Split, SubjectData
 from snarfcli.errors import UserError, nearest
 from snarfcli.motions import Motion
 
@@ -140,7 +140,7 @@ def _disk() -> _Flat:
     return points, np.concatenate([middle, *rings]), number[-1], np.ones((len(points), 1)), [4]
 
 
-def _prisms(shapes: list[_Flat], num_joints: int) -> Template:
+def _prisms(shapes: list[_Flat], num_joints: int) -> MeshTemplate:
     """Return flat shapes as closed prisms around z = 0; walls are two rows high, so that the outline itself has vertices."""
     vertices, faces, weights, count = [], [], [], 0
     for points, triangles, outline, own_weights, joints in shapes:
@@ -157,7 +157,7 @@ def _prisms(shapes: list[_Flat], num_joints: int) -> Template:
         every[:, joints] = np.concatenate([own_weights, own_weights, own_weights[outline]])
         weights.append(every)
         count += len(every)
-    return Template(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.concatenate(weights))
+    return MeshTemplate(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.concatenate(weights))
 
 
 def _inside(count: int, generator: np.random.Generator) -> NDArray[np.float64]:
@@ -180,7 +180,7 @@ def _training_angles(step_deg: int | None, generator: np.random.Generator) -> ND
     return np.concatenate([trained, _inside(max(1, round(len(trained) / 9)), generator)])
 
 
-def _sequence(name: str, split: Split, angles: NDArray[np.float64], skeleton: Skeleton, template: Template) -> SequenceSpec:
+def _sequence(name: str, split: Split, angles: NDArray[np.float64], skeleton: Skeleton, template: MeshTemplate) -> SequenceSpec:
     poses = np.zeros((len(angles), skeleton.num_joints, 3))
     poses[:, [_LOWER, _UPPER], 2] = np.deg2rad(angles)
     motion = Motion(name, poses, np.zeros((len(angles), 3)), _FRAME_RATE)

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from snarfcli.bodies import Body, Skeleton
+from snarfcli.bodies import Body, MeshTemplate, Skeleton
 from snarfcli.datasets.posed_meshes import BodyMeshes, PosedMeshes
 from snarfcli.motions import Motion
 
-__all__ = ["SequenceSpec", "Split", "SubjectData", "Template", "body_sequence", "body_template"]
+__all__ = ["SequenceSpec", "Split", "SubjectData", "body_sequence", "body_template"]
 
 Split = Literal["train", "test", "ood"]
 
@@ -31,21 +31,9 @@ class SequenceSpec:
     meshes: PosedMeshes
     """The posed mesh of every frame of the motion."""
     posed_from_rest: NDArray[np.float64] | None = None
-    """[T, J, 4, 4] bone transforms, metres, where the poses alone do not give them (joints that move or stretch)."""
+    """[T, J, 4, 4], bone transforms, metres, where the poses alone do not give them (joints that move or stretch)."""
     frames: NDArray[np.int64] | None = None
     """Numbers of the frames to use, where the data set has chosen them; else every so many as the settings say."""
-
-
-@dataclass(frozen=True, eq=False)
-class Template:
-    """A mesh of the subject in the canonical pose; for looking at and for evaluation, an avatar never sees it."""
-
-    vertices: NDArray
-    """[V, 3] metres."""
-    faces: NDArray
-    """[F, 3] vertex numbers, outward."""
-    weights: NDArray
-    """[V, J] skinning weights that the posed meshes were made with, rows sum to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +48,10 @@ class SubjectData:
     """Joints of this subject and the canonical pose."""
     sequences: tuple[SequenceSpec, ...]
     """Training, test and out-of-distribution sequences, in this order."""
-    template: Template | None = None
+    template: MeshTemplate | None = None
     """The subject's mesh in the canonical pose, where the data set has one."""
     betas: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    """[S] shape parameters of the body model; none without one."""
+    """[S], shape parameters of the body model; none without one."""
     sources: tuple[str, ...] = ()
     """What the subject was made from, such as the body's file: printed, and written to the manifest."""
     broken: tuple[tuple[str, str], ...] = ()
@@ -76,11 +64,11 @@ class SubjectData:
         return tuple(sequence for sequence in self.sequences if sequence.split == split)
 
 
-def body_template(body: Body, betas: NDArray[np.float64], skeleton: Skeleton) -> Template:
+def body_template(body: Body, betas: NDArray[np.float64], skeleton: Skeleton) -> MeshTemplate:
     """Return the mesh of a body model in the skeleton's canonical pose."""
     body = body.to(torch.float64)
     vertices = body.pose(skeleton.canonical_pose[None], betas).vertices[0]
-    return Template(vertices.numpy(), body.faces.numpy().astype(np.int32), body.weights.numpy())
+    return MeshTemplate(vertices.numpy(), body.faces.numpy().astype(np.int32), body.weights.numpy())
 
 
 def body_sequence(name: str, split: Split, motion: Motion, body: Body, betas: NDArray[np.float64]) -> SequenceSpec:

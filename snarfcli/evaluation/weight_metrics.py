@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from snarfcli.datasets.subjects import Template
+from snarfcli.bodies import MeshTemplate
 from snarfcli.models.trained_field import TrainedField
 
 __all__ = ["compare_weights", "measure_weights", "weights_text"]
@@ -21,7 +21,7 @@ __all__ = ["compare_weights", "measure_weights", "weights_text"]
 _POINTS_AT_ONCE = 65_536
 
 
-def measure_weights(avatar: TrainedField, template: Template | None) -> dict[str, Any] | None:
+def measure_weights(avatar: TrainedField, template: MeshTemplate | None) -> dict[str, Any] | None:
     """Compare an avatar's weights with those of the subject's mesh; None if either has none.
 
     Args:

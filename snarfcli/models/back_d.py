@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from snarfcli.bodies import Skeleton
+from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.models.pointwise import PointwiseSystem, PosedNetwork, into_root_frame
-from snarfcli.models.system import MeshTemplate, pose_angles
+from snarfcli.models.system import pose_angles
 
 __all__ = ["BackD"]
 

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from snarfcli.bodies import Skeleton
+from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, SearchConfig, cells_near
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.settings import AvatarConfig, ModelConfig
-from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, MeshTemplate, System
+from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
 
 __all__ = ["FastSnarf", "Snarf", "blend"]
 

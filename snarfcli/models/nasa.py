@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from snarfcli.bodies import Skeleton
+from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.bodies.kinematics import invert_rigid
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
 from snarfcli.models.settings import AvatarConfig, ModelConfig
-from snarfcli.models.system import FieldSamples, Found, MeshTemplate
+from snarfcli.models.system import FieldSamples, Found
 from snarfcli.precision import network_precision
 from snarfcli.segments import distance_to_segments
 from snarfcli.shape.network import LOGITS_PER_METRE
@@ -65,8 +65,9 @@ class Nasa(PointwiseSystem):
 
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         self.register_buffer("_segments", _own_segments(skeleton), persistent=False)
-        self.register_buffer("_vertices", None if template is None else template.vertices.clone(), persistent=False)
-        self.register_buffer("_vertex_weights", None if template is None else template.weights.clone(), persistent=False)
+        for name, values in (("_vertices", template and template.vertices), ("_vertex_weights", template and template.weights)):
+            given = None if values is None else torch.tensor(values, dtype=torch.float32)
+            self.register_buffer(name, given, persistent=False)
 
     def _make_shape(self, bones: Tensor) -> nn.Module:
         return PartNetworks(self.config.model, self.num_bones)

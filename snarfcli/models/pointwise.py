@@ -10,11 +10,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from snarfcli.bodies import Skeleton
+from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.models.extent import bone_segments
 from snarfcli.models.settings import AvatarConfig
-from snarfcli.models.system import FieldSamples, Found, MeshTemplate, System
+from snarfcli.models.system import FieldSamples, Found, System
 from snarfcli.precision import matmul_precision
 from snarfcli.segments import distance_to_segments
 

@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snarfcli.bodies import Skeleton
+from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.pointwise import PointwiseSystem, invert_blended
-from snarfcli.models.system import MeshTemplate
 from snarfcli.shape import CONDITIONS
 
 __all__ = ["SmplNN"]
@@ -34,8 +33,10 @@ class SmplNN(PointwiseSystem):
     conditions: ClassVar[tuple[str, ...]] = CONDITIONS
 
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
-        self.register_buffer("vertices", template.vertices.clone(), persistent=False)
-        self.register_buffer("vertex_weights", template.weights.clone(), persistent=False)
+        if template is None:
+            raise ValueError("template: wanted the base mesh, got none; model smpl_nn takes its skinning weights from it")
+        self.register_buffer("vertices", torch.tensor(template.vertices, dtype=torch.float32), persistent=False)
+        self.register_buffer("vertex_weights", torch.tensor(template.weights, dtype=torch.float32), persistent=False)
 
     def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         posed = [skin(self.vertices, self.vertex_weights, transforms) for transforms in bone_transforms]

@@ -17,7 +17,7 @@ from snarfcli.precision import network_precision
 from snarfcli.shape import CONDITIONS, OccupancyNetwork, joints_of_bones
 from snarfcli.shape.inference import can_evaluate, evaluate
 
-__all__ = ["NO_CORRESPONDENCE", "FieldSamples", "Found", "MeshTemplate", "System", "pose_angles"]
+__all__ = ["NO_CORRESPONDENCE", "FieldSamples", "Found", "System", "pose_angles"]
 
 NO_CORRESPONDENCE = -30.0
 """Logit of a point that no canonical point is moved onto: certainly outside."""
@@ -45,16 +45,6 @@ class FieldSamples:
 
 class Found:
     """Where posed points come from: what a system's `find` returns and its `shape_at` takes."""
-
-
-@dataclass(frozen=True)
-class MeshTemplate:
-    """A mesh of the subject with skinning weights, for the systems that are told them."""
-
-    vertices: Tensor
-    """[V, 3], canonical frame, metres."""
-    weights: Tensor
-    """[V, J], rows sum to 1."""
 
 
 def pose_angles(pose: Tensor) -> Tensor:

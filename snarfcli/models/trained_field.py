@@ -8,13 +8,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 from typing_extensions import Self
 
-from snarfcli.bodies import Skeleton
+from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import CanonicalGrid, PresetWeights
 from snarfcli.errors import UserError
 from snarfcli.files import write_tensors
@@ -26,7 +27,7 @@ from snarfcli.models.nasa import Nasa, Piecewise
 from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.smpl_nn import SmplNN
-from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, MeshTemplate, System
+from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
 
 __all__ = ["SYSTEMS", "TrainedField"]
 
@@ -95,7 +96,7 @@ class TrainedField:
             "config": asdict(self.config),
             "skeleton": self.skeleton.to_dict(),
             "grid": {"lower": self.model.grid.lower.cpu(), "upper": self.model.grid.upper.cpu()},
-            "template": None if self.template is None else {name: t.cpu() for name, t in vars(self.template).items()},
+            "template": None if self.template is None else _describe_template(self.template),
             "state": {name: value.detach().cpu().clone() for name, value in self.model.state_dict().items()},
             "facts": self.facts,
         }
@@ -235,6 +236,11 @@ class TrainedField:
         return self.model.posed_box(bone_transforms.to(self.device))
 
 
+def _describe_template(template: MeshTemplate) -> dict[str, Tensor]:
+    """Return what a file holds of a mesh: no faces, which no system uses."""
+    return {name: torch.tensor(getattr(template, name), dtype=torch.float32) for name in ("vertices", "weights")}
+
+
 def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | None:
     """Return the mesh that a file holds for a system, None where the system keeps none.
 
@@ -252,7 +258,8 @@ def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | 
             raise ValueError(f"template.{name}: wanted shape [V, {columns}], got {came}")
         if part.dtype != torch.float32 or not bool(part.isfinite().all()):
             raise ValueError(f"template.{name}: wanted finite numbers of dtype torch.float32")
-    template = MeshTemplate(content["vertices"], content["weights"])
+    vertices, weights = (content[name].numpy() for name in ("vertices", "weights"))
+    template = MeshTemplate(vertices, np.zeros((0, 3), np.int32), weights)
     if len(template.vertices) != len(template.weights):
         raise ValueError(f"template: {len(template.vertices)} vertices, but weights for {len(template.weights)}")
     return template

@@ -29,7 +29,7 @@ from snarfcli.sampling.cube import dequantise, unpack_vertices
 
 if TYPE_CHECKING:
     from snarfcli.bodies.skeleton import Skeleton
-    from snarfcli.datasets.subjects import Template
+    from snarfcli.bodies.template import MeshTemplate
 
 __all__ = [
     "FORMAT_VERSION",
@@ -85,15 +85,15 @@ class SequenceSamples:
         self._vertex_start, self._face_start = arrays["vertex_start"], arrays["face_start"]
         self._topology = arrays["topology"]
         self.poses: np.ndarray = arrays["poses"]
-        """[T, J, 3] float32 axis-angle, radians, global orientation included."""
+        """[T, J, 3], float32 axis-angle, radians, global orientation included."""
         self.translation: np.ndarray = arrays["translation"]
-        """[T, 3] float32 metres; already part of the bone transforms."""
+        """[T, 3], float32 metres; already part of the bone transforms."""
         self.bone_transforms: np.ndarray = arrays["posed_from_canonical"]
-        """[T, J, 4, 4] float32, canonical to posed, metres."""
+        """[T, J, 4, 4], float32, canonical to posed, metres."""
         self.joints: np.ndarray = arrays["joints"]
-        """[T, J, 3] float32 posed joints, metres."""
+        """[T, J, 3], float32 posed joints, metres."""
         self.frame_numbers: np.ndarray = arrays["frame_numbers"]
-        """[T] int64, numbers of the frames within the motion."""
+        """[T], int64, numbers of the frames within the motion."""
         self.frame_rate: float = description["frame_rate"]
         """Frames of the motion a second; the samples may leave some out."""
         self._cube_lower, self._cube_size = arrays["cube_lower"], arrays["cube_size"]
@@ -186,7 +186,7 @@ class SampleStore:
         """Open the store in `folder`; use `open`, which checks that there is one."""
         # here, since both need PyTorch: worker processes that only read sequences start in a fifth of the time without it
         from snarfcli.bodies.skeleton import Skeleton
-        from snarfcli.datasets.subjects import Template
+        from snarfcli.bodies.template import MeshTemplate
 
         self.folder = folder
         self.manifest = manifest
@@ -195,12 +195,12 @@ class SampleStore:
         _check_sizes(folder, manifest["files"])
         arrays = _read_arrays(folder / "subject.npz")
         self.skeleton: Skeleton = Skeleton.from_dict(arrays)
-        self.template: Template | None = None
+        self.template: MeshTemplate | None = None
         """The subject's mesh in the canonical pose, where the data set has one; float32."""
         if "vertices_canonical" in arrays:
-            self.template = Template(arrays["vertices_canonical"], arrays["faces"], arrays["vertex_weights"])
+            self.template = MeshTemplate(arrays["vertices_canonical"], arrays["faces"], arrays["vertex_weights"])
         self.betas: np.ndarray = arrays["betas"]
-        """[S] float32 shape parameters of the body model; none without one."""
+        """[S], float32 shape parameters of the body model; none without one."""
         self._sequences = [SequenceSamples(folder / entry["split"] / entry["name"], entry) for entry in manifest["sequences"]]
 
     @classmethod

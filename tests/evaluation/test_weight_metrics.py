@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from snarfcli.datasets.subjects import Template
+from snarfcli.bodies import MeshTemplate
 from snarfcli.evaluation.weight_metrics import compare_weights, measure_weights, weights_text
 
 TRUE = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 0.2, 0.8], [0.0, 0.0, 1.0]])
@@ -34,7 +34,7 @@ def test_the_avatar_is_asked_at_the_canonical_vertices():
         return torch.tensor(TRUE)
 
     avatar = SimpleNamespace(has_skinning_weights=True, skinning_weights=weights_at)
-    template = Template(vertices, np.zeros((0, 3), np.int32), TRUE)
+    template = MeshTemplate(vertices, np.zeros((0, 3), np.int32), TRUE)
     assert measure_weights(avatar, template)["wrong_share"] == 0
     assert measure_weights(avatar, None) is None
     without = SimpleNamespace(has_skinning_weights=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,7 +19,6 @@ from snarfcli.models.nasa import PartNetworks
 from snarfcli.models.pointwise import invert_blended
 from snarfcli.models.settings import ModelConfig
 from snarfcli.models.smpl_nn import nearest_vertex
-from snarfcli.models.system import MeshTemplate
 from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.shape import ConditionConfig
 from snarfcli.training.rough_shape import rough_canonical_points
@@ -33,8 +33,9 @@ def store(tmp_path_factory):
     return toy_store(tmp_path_factory.mktemp("data"), points=400, frames=12)
 
 
-def template_of(store) -> MeshTemplate:
-    return MeshTemplate(torch.tensor(store.template.vertices), torch.tensor(store.template.weights).float())
+def template_of(store) -> SimpleNamespace:
+    """Return the subject's mesh as tensors."""
+    return SimpleNamespace(vertices=torch.tensor(store.template.vertices), weights=torch.tensor(store.template.weights).float())
 
 
 def new_system(store, name: str, *, condition: str = "global", as_it_starts: bool = False, **changes) -> Avatar:
@@ -46,7 +47,7 @@ def new_system(store, name: str, *, condition: str = "global", as_it_starts: boo
     surface = rough_canonical_points(store)
     grid = CanonicalGrid.around(surface, config.skinning.margin_m)
     torch.manual_seed(0)
-    avatar = Avatar(config, store.skeleton, grid, surface, {}, template=template_of(store))
+    avatar = Avatar(config, store.skeleton, grid, surface, {}, template=store.template)
     with torch.no_grad():
         for parameter in () if as_it_starts else avatar.model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))

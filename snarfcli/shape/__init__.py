@@ -1,4 +1,4 @@
-"""Canonical shapes: pose-conditioned occupancy as a function of the canonical point."""
+"""Canonical shapes: pose-conditioned occupancy at canonical points."""
 
 from snarfcli.shape.condition import CONDITIONS, ConditionConfig, joints_of_bones
 from snarfcli.shape.network import OccupancyNetwork, ShapeConfig

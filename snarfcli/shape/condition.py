@@ -1,4 +1,4 @@
-"""What of the pose each canonical point is told: every joint's angles, those of the joints that move it, or nothing."""
+"""The pose condition of canonical points: the angles of all joints, of the joints that move the point, or none."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from torch import Tensor
 __all__ = ["CONDITIONS", "ConditionConfig", "joints_of_bones"]
 
 CONDITIONS = ("global", "local", "none")
+"""Kinds of pose conditions, see `ConditionConfig.name`."""
 
 
 @dataclass
 class ConditionConfig:
     name: str = "global"
-    """global (every joint's angles at every point, as in the papers), local (those of the joints that move it) or none."""
+    """global (angles of all joints at every point, as in the papers), local (of the joints that move the point) or none."""
     layer: int | None = None
-    """Layer of the canonical shape that the condition enters; null: shape.condition_layer."""
+    """Layer of the canonical shape that gets the condition; null: shape.condition_layer."""
     size: int | None = None
-    """Size of the code that it is reduced to before; null: shape.condition_size."""
+    """Size of the code to which the condition is first reduced; null: shape.condition_size."""
 
 
 def joints_of_bones(parents: Sequence[int]) -> Tensor:
-    """Return which joints the points of each bone see, [J, J - 1], 0 or 1.
+    """Return which joints condition the points of each bone, [J, J - 1], 0 or 1.
 
-    A bone is bounded by the joint that it turns about and by those of its children; the root's angles are the global
-    orientation, which changes no shape, so it is not among the columns.
+    They are the joint that the bone turns about and the joints of its children. The root is not among the columns: its angles
+    are the global orientation, which does not change the shape.
     """
     seen = torch.zeros(len(parents), len(parents))
     for joint, parent in enumerate(parents):

@@ -1,4 +1,4 @@
-"""The occupancy network without gradients on a CPU, by the native library: several times faster than layer by layer."""
+"""The occupancy network without gradients on a CPU, by the native library: several times as fast as layer by layer."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class _Network(Structure):
 
 
 def can_evaluate(network: torch.nn.Module, points: Tensor) -> bool:
-    """Return whether `evaluate` can stand in for the network's own forward pass: no gradient, float32, CPU, and a library."""
+    """Return whether `evaluate` can replace the forward pass: no gradients, float32, a CPU, and the native library loaded."""
     return (
         isinstance(network, OccupancyNetwork)
         and not torch.is_grad_enabled()
         and not torch.compiler.is_compiling()
         and points.device.type == "cpu"
-        and points.dtype == network.layers[0].bias.dtype == torch.float32
+        and points.dtype == network.linears[0].bias.dtype == torch.float32
         and native_library() is not None
     )
 
@@ -60,34 +60,35 @@ def can_evaluate(network: torch.nn.Module, points: Tensor) -> bool:
 def evaluate(
     network: OccupancyNetwork, canonical: Tensor, condition: Tensor, pose: Tensor, seen: Tensor | None = None
 ) -> Tensor:
-    """Return what `network(canonical, condition, pose, seen)` returns, to rounding: logits [M] at canonical points [M, 3].
+    """Return `network(canonical, condition, pose, seen)` up to rounding: logits [M] at canonical points [M, 3].
 
     Args:
-        network: in full precision on the CPU.
-        canonical: [M, 3] float32, metres.
-        condition: pose condition of each pose, [B, C].
-        pose: index of each point's pose, [M], 0 to B - 1.
-        seen: how much each point sees of each part of the condition, [M, P]; all of it if None.
+        network: in float32 on the CPU.
+        canonical: [M, 3], float32, metres.
+        condition: [B, C], pose condition of each pose.
+        pose: [M], index of the pose of each point, 0 to B - 1.
+        seen: [M, P], share of each part of the condition at each point; None for all of it.
 
     Raises:
         MemoryError: there is not enough memory.
     """
     logits = canonical.new_empty(len(canonical))
-    for number, one in enumerate(condition):
+    for index, one in enumerate(condition):
         if len(condition) == 1:
             logits[:] = _evaluate(network, canonical, one, seen)
         else:
-            own = (pose == number).nonzero()[:, 0]
-            logits[own] = _evaluate(network, canonical[own], one, None if seen is None else seen[own])
+            chosen = (pose == index).nonzero()[:, 0]
+            logits[chosen] = _evaluate(network, canonical[chosen], one, None if seen is None else seen[chosen])
     return logits
 
 
 def _evaluate(network: OccupancyNetwork, canonical: Tensor, condition: Tensor, seen: Tensor | None) -> Tensor:
-    """Evaluate points of one pose; `condition` [C]."""
-    config = network.config
+    """Return the logits [M] at points [M, 3] of one pose with condition [C]."""
+    library, config = native_library(), network.config
+    assert library is not None  # see can_evaluate
     extras = seen.float().contiguous() if network.conditioned and seen is not None else None
     count = 0 if extras is None else extras.shape[1]
-    tensors = list(_layer_tensors(network, condition, count))  # they must outlive the call, as all else that is pointed to
+    tensors = list(_layer_tensors(network, condition, count))  # must outlive the call, like all memory it points to
     layers = (_Layer * len(tensors))()
     for index, (weight, bias) in enumerate(tensors):
         layers[index] = _Layer(
@@ -112,7 +113,7 @@ def _evaluate(network: OccupancyNetwork, canonical: Tensor, condition: Tensor, s
         count,
     )
     out = points.new_empty(len(points))
-    code = native_library().snarf_evaluate(
+    code = library.snarf_evaluate(
         byref(native),
         c_void_p(points.data_ptr()),
         c_void_p(None if extras is None else extras.data_ptr()),
@@ -121,24 +122,24 @@ def _evaluate(network: OccupancyNetwork, canonical: Tensor, condition: Tensor, s
         c_void_p(out.data_ptr()),
     )
     if code == 2:
-        raise MemoryError("evaluating the shape ran out of memory; give fewer points at once")
+        raise MemoryError("evaluating the shape ran out of memory; evaluate fewer points at once")
     if code:
-        raise RuntimeError(f"the native library refused the network (code {code})")
+        raise RuntimeError(f"the native library rejected the network (code {code})")
     return out
 
 
 def _layer_tensors(network: OccupancyNetwork, condition: Tensor, parts: int) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield weight and bias of each layer in one pose [C]: columns for the layer before, the encoded point, the parts seen.
+    """Yield weight and bias of each layer for one condition [C]; columns: previous layer, encoded point, parts seen.
 
-    The pose code becomes a part of the bias, or, where points see `parts` of the condition, that many columns, since it is
-    linear in what they see.
+    The pose code is added to the bias. If the points see `parts` of the condition, it becomes that number of columns instead,
+    since it is linear in the shares seen.
     """
     config = network.config
-    for index, layer in enumerate(network.layers):
+    for index, layer in enumerate(network.linears):
         weight, bias = layer.weight, layer.bias
         columns = []
-        if network.conditioned and index == config.condition_layer:
-            weight, code = weight.tensor_split([weight.shape[1] - config.condition_size], dim=1)
+        if network.pose_code is not None and index == config.condition_layer:
+            weight, code = weight.tensor_split((weight.shape[1] - config.condition_size,), dim=1)
             if parts:
                 mapping = network.pose_code.weight.unflatten(1, (parts, -1))  # [K, P, C / P]
                 columns = [code @ torch.einsum("pc,kpc->kp", condition.view(parts, -1), mapping)]

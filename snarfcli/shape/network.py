@@ -1,4 +1,4 @@
-"""The canonical occupancy network f(x, p) of SNARF Eq. 1, as logits: occupied where positive."""
+"""The canonical occupancy network f(x, p) of SNARF Eq. 1; it returns logits, positive where occupied."""
 
 from __future__ import annotations
 
@@ -15,36 +15,35 @@ __all__ = ["LOGITS_PER_METRE", "SOFTPLUS_SHARPNESS", "OccupancyNetwork", "ShapeC
 
 SOFTPLUS_SHARPNESS = 100.0  # as in the papers' code
 LOGITS_PER_METRE = 30.0
-"""Slope of a capsule prior across its surface."""
+"""Slope of the capsule prior across its surface."""
 
 
 @dataclass
 class ShapeConfig:
     name: str = "mlp"
-    """Which canonical shape: mlp."""
+    """Canonical shape: mlp."""
     width: int = 256
     """Width of the hidden layers."""
     depth: int = 8
     """Number of hidden layers."""
     activation: str = "softplus"
-    """softplus (with a sharpness of 100) or relu."""
+    """Activation: softplus (with a sharpness of 100) or relu."""
     skip_layers: list[int] = field(default_factory=lambda: [4])
-    """Layers whose input is joined with the point once more."""
+    """Layers that get the point as an additional input."""
     frequencies: list[float] = field(default_factory=list)
-    """Angular frequencies of a sine and cosine encoding of the point, per metre; none for the bare point."""
+    """Angular frequencies of a sine and cosine encoding of the point, radians per metre; an empty list for no encoding."""
     condition_layer: int | None = 6
-    """Layer that the pose condition enters, where condition.layer does not say another (it does with condition=local); null
-    for a shape without pose condition."""
+    """Layer that gets the pose condition, unless condition.layer is set (as with condition=local); null for no pose condition."""
     condition_size: int = 8
-    """Size of the code that the pose is reduced to before it enters, where condition.size does not say another."""
+    """Size of the code to which the pose condition is reduced first, unless condition.size is set."""
     condition_at_start: bool = True
-    """Whether the pose has an influence from the start; false starts from a shape that is the same in every pose."""
+    """Whether the pose has an influence at the start of training; false starts from the same shape in all poses."""
     geometric_init: bool = True
-    """Whether the network starts as a sphere of one metre (Atzmon and Lipman 2020)."""
+    """Whether the network starts as a sphere with a radius of one metre (Atzmon and Lipman 2020)."""
     weight_norm: bool = True
     """Whether the layers are weight-normalised."""
     prior_radius_m: float | None = None
-    """Radius of capsules around the bones that the network only corrects, metres; null for no such prior."""
+    """Radius of capsules around the bones, metres, which the network corrects; null for no such prior."""
 
 
 class OccupancyNetwork(nn.Module):
@@ -53,20 +52,26 @@ class OccupancyNetwork(nn.Module):
     Args:
         config: architecture.
         pose_size: length of the pose condition; 0 for none.
-        bones: canonical ends of the bones, [S, 2, 3], metres, for the capsule prior.
+        bones: [S, 2, 3], canonical ends of the bones, metres, for the capsule prior.
 
-    The pose condition is joined to the input of one layer. Since it is the same for all points of a pose, its part of that
-    layer is evaluated once per pose and added to the points as a bias.
+    Raises:
+        ValueError: a setting of the architecture is out of range.
+
+    The pose condition is an additional input of one layer. Since it is the same for all points of a pose, its part of that
+    layer is evaluated once per pose and added as a bias.
     """
+
+    bones: Tensor
+    frequencies: Tensor
 
     def __init__(self, config: ShapeConfig, pose_size: int, bones: Tensor) -> None:
         super().__init__()
         self.config = config
         if config.activation not in ("softplus", "relu"):
-            raise ValueError(f"shape.activation must be softplus or relu, got {config.activation!r}")
+            raise ValueError(f"shape.activation: wanted softplus or relu, got {config.activation!r}")
         self.conditioned = config.condition_layer is not None and pose_size > 0
-        if self.conditioned and not 0 <= config.condition_layer < config.depth:
-            raise ValueError(f"shape.condition_layer must lie in 0..{config.depth - 1}, got {config.condition_layer}")
+        if config.condition_layer is not None and pose_size > 0 and not 0 <= config.condition_layer < config.depth:
+            raise ValueError(f"shape.condition_layer: wanted 0 to {config.depth - 1}, got {config.condition_layer}")
         self.register_buffer("bones", bones.clone())
         self.register_buffer("frequencies", torch.tensor(config.frequencies), persistent=False)
         point_size = 3 + 6 * len(config.frequencies)
@@ -81,20 +86,25 @@ class OccupancyNetwork(nn.Module):
             layers.append(nn.utils.parametrizations.weight_norm(layer) if config.weight_norm else layer)
         self.layers = nn.ModuleList(layers)
 
+    @property
+    def linears(self) -> list[nn.Linear]:
+        """The layers, in the order of evaluation."""
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+
     def _initialise(self, layer: nn.Linear, index: int, joined: int) -> None:
-        """Set a layer's first weights; `joined` of its last inputs are the pose code."""
+        """Set the initial weights of a layer; its last `joined` inputs are the pose code."""
         last = index == self.config.depth
         with torch.no_grad():
             if self.config.geometric_init:
                 if last:
-                    # The sign is turned round, since occupancy is positive inside where a distance is negative.
+                    # The sign is opposite to the source: logits are positive inside, distances negative.
                     layer.weight.normal_(-math.sqrt(math.pi) / math.sqrt(layer.in_features), 1e-4)
                     layer.bias.fill_(1.0)
                 else:
                     layer.weight.normal_(0, math.sqrt(2) / math.sqrt(layer.out_features))
                     layer.bias.zero_()
                 if index == 0 or index in self.config.skip_layers:
-                    # only the bare point has an influence at first, as waves would make it no sphere
+                    # Only the point itself has an influence at first: with the waves it would not be a sphere.
                     waves = 6 * len(self.config.frequencies)
                     end = layer.in_features - joined
                     layer.weight[:, end - waves : end] = 0
@@ -108,25 +118,24 @@ class OccupancyNetwork(nn.Module):
         """Return occupancy logits [M] at canonical points [M, 3], metres.
 
         Args:
-            canonical: points [M, 3], metres.
-            condition: pose condition of each pose, [B, C].
-            pose: index of each point's pose, [M], 0 to B - 1.
-            seen: how much each point sees of each part of the condition, [M, P], where C is P parts of equal length; all of
-                it if None.
+            canonical: [M, 3], metres.
+            condition: [B, C], pose condition of each pose.
+            pose: [M], index of the pose of each point, 0 to B - 1.
+            seen: [M, P], share of each of the P equal parts of the condition at each point; None for all of it.
         """
         encoded = self._encode(canonical)
         h = encoded
-        for index, layer in enumerate(self.layers):
+        for index, layer in enumerate(self.linears):
             if index in self.config.skip_layers and index > 0:
                 h = torch.cat([h, encoded], 1) / math.sqrt(2)
-            if self.conditioned and index == self.config.condition_layer:
+            if self.pose_code is not None and index == self.config.condition_layer:
                 weight = layer.weight
-                points = h.shape[1]
+                inputs = h.shape[1]
                 if seen is None:
-                    code = (self.pose_code(condition) @ weight[:, points:].T + layer.bias).index_select(0, pose)
+                    code = (self.pose_code(condition) @ weight[:, inputs:].T + layer.bias).index_select(0, pose)
                 else:
-                    code = self._local_code(condition, pose, seen) @ weight[:, points:].T + layer.bias
-                h = F.linear(h, weight[:, :points]) + code
+                    code = _local_code(self.pose_code, condition, pose, seen) @ weight[:, inputs:].T + layer.bias
+                h = F.linear(h, weight[:, :inputs]) + code
             else:
                 h = layer(h)
             if index < len(self.layers) - 1:
@@ -137,18 +146,19 @@ class OccupancyNetwork(nn.Module):
             logits = logits + LOGITS_PER_METRE * (self.config.prior_radius_m - distance)
         return logits
 
-    def _local_code(self, condition: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
-        """Return the pose code [M, K] of each point, made of what it sees of the condition."""
-        parts = seen.shape[1]
-        mapping = self.pose_code.weight.unflatten(1, (parts, -1))  # [K, P, C / P]
-        codes = torch.einsum("bpc,kpc->pbk", condition.unflatten(1, (parts, -1)), mapping)
-        every = (seen @ codes.flatten(1)).unflatten(1, (len(condition), -1))  # of every pose, which is a small product
-        chosen = pose[:, None, None].expand(-1, 1, every.shape[2])
-        return every.gather(1, chosen)[:, 0] + self.pose_code.bias
-
     def _encode(self, canonical: Tensor) -> Tensor:
         """Return points with their sine and cosine encoding, [M, 3 + 6 F]."""
         if not len(self.frequencies):
             return canonical
         angles = (canonical[:, None] * self.frequencies[:, None]).flatten(1)
         return torch.cat([canonical, angles.sin(), angles.cos()], 1)
+
+
+def _local_code(pose_code: nn.Linear, condition: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
+    """Return the pose code [M, K] of each point, from the parts of the condition that it sees."""
+    parts = seen.shape[1]
+    mapping = pose_code.weight.unflatten(1, (parts, -1))  # [K, P, C / P]
+    codes = torch.einsum("bpc,kpc->pbk", condition.unflatten(1, (parts, -1)), mapping)
+    every = (seen @ codes.flatten(1)).unflatten(1, (len(condition), -1))  # for all poses, which is a small product
+    chosen = pose[:, None, None].expand(-1, 1, every.shape[2])
+    return every.gather(1, chosen)[:, 0] + pose_code.bias

@@ -88,10 +88,10 @@ def test_gradcheck():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"activation": "tanh"}, "shape.activation must be softplus or relu, got 'tanh'"),
-        ({"condition_layer": 8}, r"shape.condition_layer must lie in 0..7, got 8"),
+        ({"activation": "tanh"}, "shape.activation: wanted softplus or relu, got 'tanh'"),
+        ({"condition_layer": 8}, "shape.condition_layer: wanted 0 to 7, got 8"),
     ],
 )
-def test_settings_that_make_no_network_are_refused(change, message):
+def test_settings_that_make_no_network_are_rejected(change, message):
     with pytest.raises(ValueError, match=message):
         OccupancyNetwork(ShapeConfig(**change), 6, BONES)

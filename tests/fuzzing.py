@@ -1,7 +1,7 @@
-"""Reads broken files by the thousand: whatever bytes a file holds, a reader returns or raises one `UserError` of one line.
+"""Fuzzing of file readers: for any bytes, a reader returns or raises a `UserError` whose message is one line.
 
-Each file is a seed of its target, broken in one to four places. Number `index` of seed `seed` is always the same file, so a
-failure can be repeated alone: `broken_file(target, seed, index)`.
+Each file is a seed file of its target, damaged in one to four places. File `index` of seed `seed` is always the same, so that
+a failure can be repeated alone: `broken_file(target, seed, index)`.
 """
 
 from __future__ import annotations
@@ -28,52 +28,53 @@ from snarfcli.errors import UserError
 
 __all__ = ["Target", "broken_file", "check_target", "find_failures", "scratch_folder"]
 
-MAX_SECONDS = 5.0
+MAX_CPU_SECONDS = 5.0  # processor time, which does not depend on how busy the machine is
 MAX_GROWTH = 2**30
 MAX_MESSAGE = 1000
-# A reader stuck inside native code hears no signal. This long after the start the process is ended with a stack trace.
-_STUCK_SECONDS = 20.0
+# A reader that waits, or hangs in native code, is not interrupted by a signal: after this time the process ends with a stack
+# trace. Wall time, so far above the limit that a busy machine does not reach it.
+_STUCK_SECONDS = 600.0
 
 
 @dataclass(frozen=True)
 class Target:
-    """One reader and what it should be fed with."""
+    """A reader, and how its test files are made."""
 
     name: str
     """For example `bvh`."""
     suffix: str
-    """Of the files, for example `.bvh`."""
+    """File suffix, for example `.bvh`."""
     seeds: Callable[[], list[bytes]]
-    """Small files that the reader accepts (some hundred bytes to some kB), of several kinds."""
+    """Return small files that the reader accepts (100 bytes to some kB), of several kinds."""
     read: Callable[[Path], object]
     """The public reader."""
     extra: Callable[[random.Random, bytes], bytes] | None = None
-    """One more way of breaking a seed, which knows the format: wrong shapes, other types, cycles."""
+    """Damage a seed file with knowledge of its format: wrong shapes, other types, cycles."""
 
 
 class _TookTooLong(BaseException):
-    """Not an Exception, so that no reader mistakes it for something wrong with its file."""
+    """The reader exceeded its time. Not an Exception, so that no reader takes it for an error in its file."""
 
 
 class _Forbidden(BaseException):
-    """A reader began something that no file may cause."""
+    """The reader did something that no file may cause."""
 
 
 def check_target(target: Target, count: int, seed: int, folder: Path) -> None:
-    """Read `count` broken files, and fail at the first that is not handled as it should be.
+    """Read `count` damaged files, and fail at the first that is mishandled.
 
-    Good is: the reader returns, or raises a `UserError` whose message is one printable line that holds the file's name. Either
-    way within 5 s, with less than 1 GiB of memory, starting no program, connecting nowhere, and writing, moving or removing
-    nothing.
+    A file is handled if the reader returns, or raises a `UserError` whose message is one printable line with the file's name.
+    It takes at most 5 s of processor time and 1 GiB of memory, starts no program, opens no connection, and writes, moves and
+    removes no file.
 
     Args:
         target: the reader.
-        count: files.
+        count: number of files.
         seed: of the damage; the same seed makes the same files.
-        folder: where the bytes of the failing file are kept.
+        folder: where the failing file is kept.
 
     Raises:
-        AssertionError: a file was not handled; the message says which, and where it was kept.
+        AssertionError: a file was mishandled; the message says which, and where it is kept.
     """
     with scratch_folder() as scratch:
         for failure in find_failures(target, range(count), seed, folder, scratch):
@@ -81,18 +82,18 @@ def check_target(target: Target, count: int, seed: int, folder: Path) -> None:
 
 
 def find_failures(target: Target, indices: Iterable[int], seed: int, folder: Path, scratch: Path) -> Iterator[str]:
-    """Read the broken files `indices` and yield a line (and a stack trace, where there is one) for each mishandled one.
+    """Read the damaged files `indices`; for each mishandled one, yield a line and, if there is one, a stack trace.
 
-    The file being read is `scratch/fuzz<suffix>` and its number is in `scratch/index`: so they can be found after a crash.
+    The current file is `scratch/fuzz<suffix>` and its number is in `scratch/index`, so that both can be found after a crash.
     """
     path = scratch / f"fuzz{target.suffix}"
     seeds = target.seeds()
     assert seeds, f"{target.name}: no seeds"
     for number, content in enumerate(seeds):
         path.write_bytes(content)
-        failure, refused = _try(target, path, _peak_memory())
-        if failure or refused:
-            yield f"{target.name}: seed {number} must be a good file: {failure or refused}"
+        failure, message = _try(target, path, _peak_memory())
+        if failure or message:
+            yield f"{target.name}: seed {number} must be a good file: {failure or message}"
             return
     peak = _peak_memory()
     for index in indices:
@@ -109,7 +110,7 @@ def find_failures(target: Target, indices: Iterable[int], seed: int, folder: Pat
 
 
 def broken_file(target: Target, seed: int, index: int, seeds: list[bytes] | None = None) -> bytes:
-    """Return file `index`: one of the seeds with one to four kinds of damage."""
+    """Return file `index`: a seed file with one to four kinds of damage."""
     rng = random.Random(f"{target.name}/{seed}/{index}")
     seeds = target.seeds() if seeds is None else seeds
     content = rng.choice(seeds)
@@ -124,7 +125,7 @@ def broken_file(target: Target, seed: int, index: int, seeds: list[bytes] | None
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Yield a new folder, in memory where the system has such a place, and remove it afterwards."""
+    """Yield a new folder, in memory where the system allows it, and remove it afterwards."""
     memory = Path("/dev/shm")
     parent = memory if memory.is_dir() and os.access(memory, os.W_OK) else None
     folder = Path(tempfile.mkdtemp(prefix="snarf-fuzz-", dir=parent))
@@ -135,35 +136,35 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _try(target: Target, path: Path, peak: int) -> tuple[str, str]:
-    """Read one file; return what is wrong with how that went, and the message if the file was refused."""
-    refused, failure = "", ""
-    start = time.monotonic()
+    """Read one file; return what the reader did wrong, and the message of its `UserError`; both may be empty."""
+    message, failure = "", ""
+    start = time.process_time()
     try:
         with _watched(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             target.read(path)
     except UserError as error:
-        refused = str(error)
+        message = str(error)
     except _TookTooLong:
-        failure = f"took over {MAX_SECONDS:g} s\n{traceback.format_exc(limit=-8)}"
+        failure = f"took over {MAX_CPU_SECONDS:g} s\n{traceback.format_exc(limit=-8)}"
     except (KeyboardInterrupt, GeneratorExit):
         raise
     except BaseException as error:  # SystemExit and pytest's own too: a reader may raise nothing but UserError
         failure = f"{type(error).__name__}: {error}\n{traceback.format_exc(limit=-8)}"
-    elapsed = time.monotonic() - start
-    if not failure and elapsed > MAX_SECONDS:
-        failure = f"took {elapsed:.1f} s, wanted at most {MAX_SECONDS:g}"
+    cpu_seconds = time.process_time() - start
+    if not failure and cpu_seconds > MAX_CPU_SECONDS:
+        failure = f"took {cpu_seconds:.1f} s, wanted at most {MAX_CPU_SECONDS:g}"
     if not failure and (growth := _peak_memory() - peak) > MAX_GROWTH:
         failure = f"took {growth / 2**30:.1f} GiB of memory, wanted at most 1"
-    if not failure and refused:
-        failure = _wrong_message(refused, path)
-    return failure, refused
+    if not failure and message:
+        failure = _wrong_message(message, path)
+    return failure, message
 
 
 def _wrong_message(message: str, path: Path) -> str:
     if path.name not in message:
         return f"the message does not name the file: {message!r}"
-    if not message.isprintable():  # line ends, terminal controls, lone surrogates: show what a file holds by its repr
+    if not message.isprintable():  # line ends, terminal controls, lone surrogates: show the content of a file by its repr
         return f"the message is not one printable line: {message!r}"
     if len(message) - len(str(path)) > MAX_MESSAGE:
         return f"the message has {len(message)} characters: {message[:200]!r} ..."
@@ -183,25 +184,24 @@ _is_hooked = False
 
 @contextmanager
 def _watched() -> Iterator[None]:
-    """Limit the time of the block, and forbid what no file may cause."""
+    """Limit the processor time of the block, and forbid what no file may cause."""
     global _is_hooked
     if not _is_hooked:  # hooks cannot be removed again
         sys.addaudithook(_audit)
         _is_hooked = True
     has_signal = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-    if has_signal:
-        previous = signal.signal(signal.SIGALRM, _raise_took_too_long)
+    previous = signal.signal(signal.SIGPROF, _raise_took_too_long) if has_signal else None
     try:
         faulthandler.dump_traceback_later(_STUCK_SECONDS, exit=True, file=sys.__stderr__)
-        if has_signal:  # again and again, should something swallow the first one
-            signal.setitimer(signal.ITIMER_REAL, MAX_SECONDS, 1.0)
+        if has_signal:  # repeatedly, in case the reader swallows the first one
+            signal.setitimer(signal.ITIMER_PROF, MAX_CPU_SECONDS, 1.0)
         _state.is_reading = True
         yield
     finally:
         _state.is_reading = False
         if has_signal:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, previous)
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            signal.signal(signal.SIGPROF, previous)
         faulthandler.cancel_dump_traceback_later()
 
 
@@ -220,7 +220,7 @@ def _audit(event: str, arguments: tuple) -> None:
 
 
 def _peak_memory() -> int:
-    """Return the most memory that this process ever had, in bytes; 0 where the system does not tell."""
+    """Return the peak memory of this process, bytes; 0 where the system does not report it."""
     try:
         import resource
     except ImportError:

@@ -10,7 +10,7 @@ from snarfcli.viewer.body import ViewerBody
 from snarfcli.viewer.picture import Picture, ViewerLook
 from snarfcli.viewer.state import ViewerState
 
-PATIENCE = 60  # seconds; nothing waits that long unless something is wrong
+PATIENCE_S = 300  # only a broken test waits that long, however busy the machine is
 SMALL = ViewerLook(skinned_resolution=24, field_resolution=24)
 
 
@@ -33,4 +33,4 @@ class Watched:
             picture = self.picture()
             if not picture.is_computing:
                 return picture
-            assert self.woken.wait(PATIENCE)
+            assert self.woken.wait(PATIENCE_S)

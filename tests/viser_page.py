@@ -1,4 +1,4 @@
-"""The browser's side of viser's connection, as far as the tests need it: it reads messages and changes inputs."""
+"""A client of viser's server for the tests: it reads messages and changes inputs, as the browser does."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 __all__ = ["Page"]
 
-PATIENCE = 10  # seconds; nothing waits that long unless something is wrong
+PATIENCE_S = 300  # only a broken test waits that long, however busy the machine is
 
 
 class Page:
@@ -25,13 +25,13 @@ class Page:
         port, known, came = server.get_port(), set(server.get_clients()), queue.Queue()
         server.on_client_connect(lambda client: came.put(client.client_id))
         self._socket = connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, open_timeout=PATIENCE
+            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, open_timeout=PATIENCE_S
         )
         self.messages: list[dict[str, Any]] = []
         self._mark = 0
         self._send(_messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 3), 0.8, 0.1, 100, 480, 640, (0, 0, 0), (0, 1, 0)))
         self.until(lambda message: message["type"] == "ReplayDoneMessage")
-        while came.get(timeout=PATIENCE) in known:  # before that the server does not listen
+        while came.get(timeout=PATIENCE_S) in known:  # before that the server does not listen
             pass
 
     def __enter__(self) -> Page:
@@ -41,42 +41,42 @@ class Page:
         self._socket.close()
 
     def drop(self) -> None:
-        """Be gone without a word."""
+        """Drop the connection without closing it properly."""
         self._socket.socket.close()
 
     def until(self, is_it: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
-        """Return a message that is what is waited for, the first one since the last change from here; wait for it."""
-        seen, deadline = self._mark, time.monotonic() + PATIENCE
+        """Wait for a message that satisfies `is_it`; return the first one since the last change from here."""
+        seen, deadline = self._mark, time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             for message in self.messages[seen:]:
                 if is_it(message):
                     return message
             seen = len(self.messages)
-            data = self._socket.recv(timeout=PATIENCE)
+            data = self._socket.recv(timeout=PATIENCE_S)
             length = int.from_bytes(data[8:16], "little")
             self.messages += msgspec.msgpack.decode(zstandard.decompress(data[16 : 16 + length]))["messages"]
-        raise TimeoutError("no such message came")
+        raise TimeoutError(f"no such message came within {PATIENCE_S} s")
 
     def expect(self) -> None:
-        """Wait from now on for messages that are new."""
+        """Ignore the messages so far: `until` waits for later ones."""
         self._mark = len(self.messages)
 
     def until_node(self, name: str, prop: str) -> dict[str, Any]:
-        """Wait until a property of a node of the scene changes."""
+        """Wait until a property of a scene node changes."""
         kind = "SceneNodeUpdateMessage"
         return self.until(lambda m: m["type"] == kind and m["name"] == name and prop in m["updates"])
 
     def until_text(self, part: str) -> None:
-        """Wait until a text on the panel has this part."""
+        """Wait until a text on the panel contains this part."""
         self.until(lambda message: part in str(message.get("updates", {}).get("_markdown", "")))
 
     def uuid(self, label: str, number: int = 0) -> str:
-        """Return viser's name for the input with this label, the `number`th one of the panel."""
+        """Return viser's identifier of the input with this label, the `number`th one on the panel."""
         found = [message for message in self.messages if label in _labels(message)]
         return found[number]["uuid"]
 
     def change(self, label: str, value: Any, number: int = 0) -> None:
-        """Change an input as somebody at this page would, or press a button."""
+        """Change an input, or press a button, as a user of the page would."""
         self.expect()
         self._send(_messages.GuiUpdateMessage(self.uuid(label, number), {"value": value}))
 
@@ -85,5 +85,5 @@ class Page:
 
 
 def _labels(message: dict[str, Any]) -> set[str]:
-    """Return the labels that a message gives to an input."""
+    """Return the labels of inputs in a message."""
     return {part.get("label") for part in (message.get("props", {}), message.get("updates", {}))} - {None}

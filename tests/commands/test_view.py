@@ -110,7 +110,7 @@ def test_the_page_is_served_and_opened(served, opened, caplog):
     assert f"page: {address} (Ctrl-C ends it)" in caplog.text
     assert "ssh -L" not in caplog.text
     assert "anybody" not in caplog.text
-    with urllib.request.urlopen(address, timeout=60) as answer:
+    with urllib.request.urlopen(address, timeout=300) as answer:
         assert answer.status == 200
     assert server.state.motion is None
     assert server.state.look.skinned_resolution == 24

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 
 import numpy as np
 import pytest
@@ -175,9 +174,7 @@ def test_deep_nesting_is_no_recursion(tmp_path):
     depth = 4000
     text = "HIERARCHY\nROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation\n"
     text += "JOINT b { OFFSET 0 1 0 CHANNELS 0\n" * (depth - 1) + "}" * depth + "\nMOTION\nFrames: 1\nFrame Time: 1\n90\n"
-    start = time.monotonic()
     rig = read_bvh(write(tmp_path, text))
-    assert time.monotonic() - start < 5
     np.testing.assert_allclose(rig.clips[0].world_from_joint[0, -1, :3, 3], [0, 0, depth - 1], atol=1e-9)
 
 

@@ -175,7 +175,7 @@ def test_a_command_that_is_stopped_gets_one_ctrl_c(tmp_path, monkeypatch):
     script.write_text(
         "import signal, sys, time\n"
         "def handle(*_): print('checkpoint written', flush=True); sys.exit(130)\n"
-        "signal.signal(signal.SIGINT, handle)\nprint('ready', flush=True)\ntime.sleep(60)\n"
+        "signal.signal(signal.SIGINT, handle)\nprint('ready', flush=True)\ntime.sleep(600)\n"
     )
     original = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", lambda command, **more: original([sys.executable, str(script)], **more))

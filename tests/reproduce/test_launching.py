@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import signal
 import subprocess
 import sys
-import threading
-import time
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -16,6 +16,7 @@ from made_up_runs import fake_plan, fake_run
 
 from snarfcli.errors import UserError
 from snarfcli.reproduce import launching
+from snarfcli.reproduce.jobs import JobStatus
 from snarfcli.reproduce.launching import Launcher, check_launcher, launch, run_planned_job
 
 
@@ -47,27 +48,23 @@ def test_a_launcher_that_does_not_start_is_an_error(tmp_path, monkeypatch):
 @pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
 def test_ctrl_c_stops_jobs_and_waits_for_them(tmp_path, monkeypatch):
     jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
-    # a launcher that waits for the sign to stop, as a job does
-    code = "import pathlib, sys, time\nwork = pathlib.Path(sys.argv[1])\n"
-    code += "(work / 'begun').touch()\nwhile not (work / 'stop').exists(): time.sleep(0.05)\n(work / 'ended').touch()\n"
-    original, begun = subprocess.Popen, time.monotonic()
+    # a launcher that reports a running job and waits for the sign to stop, as the job does
+    code = "import pathlib, sys, time\nwork = pathlib.Path(sys.argv[1])\n(work / '0.json').write_text(sys.argv[2])\n"
+    code += "while not (work / 'stop').exists(): time.sleep(0.05)\n(work / 'ended').touch()\n"
+    running = json.dumps(asdict(JobStatus("running", jobs[0].digest)))
+    original = subprocess.Popen
 
     def popen(command, **more):
         (work,) = (tmp_path / "work").iterdir()
-        return original([sys.executable, "-c", code, str(work)], **more)
+        return original([sys.executable, "-c", code, str(work), running], **more)
 
     monkeypatch.setattr(subprocess, "Popen", popen)
 
-    def press():
-        while not list(tmp_path.glob("work/*/begun")) and time.monotonic() - begun < 20:
-            time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGTERM)  # taken for Ctrl-C
+    def interrupt(number: int, status: JobStatus) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)  # handled as Ctrl-C is
 
-    thread = threading.Thread(target=press)
-    thread.start()
     with pytest.raises(KeyboardInterrupt):
-        launch(jobs, tmp_path / "work", Launcher(), lambda *_: None)
-    thread.join()
+        launch(jobs, tmp_path / "work", Launcher(), interrupt)
     assert list(tmp_path.glob("work/*/ended")), "it was waited for"
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
@@ -84,7 +81,7 @@ def test_launchers_that_are_not_installed_name_what_to_install(monkeypatch, any_
         check_launcher(Launcher("joblib", 2))
     with pytest.raises(UserError, match=r"pip install 'snarf\[submitit\]'"):
         check_launcher(Launcher("submitit_slurm"))
-    with pytest.raises(UserError, match="one job at a time, got processes=2; give launcher=joblib"):
+    with pytest.raises(UserError, match="processes: wanted 1 with launcher=basic, got 2; give launcher=joblib"):
         check_launcher(Launcher("basic", 2))
 
 

@@ -25,7 +25,7 @@ if CHROMIUM is None:
 # WebGL by the processor: no GPU is needed.
 _FLAGS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
 _BODY = {"x": 100, "y": 100, "width": 500, "height": 400}  # of the window, left of the panel
-_PATIENCE_MS = 60_000
+_PATIENCE_MS = 300_000
 
 
 def load_motion(name: str):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from torch import Tensor
 from toy_avatar import RADIUS
-from toy_viewer import PATIENCE, Watched
+from toy_viewer import PATIENCE_S, Watched
 
 from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.viewer.picture import Picture
@@ -47,7 +47,7 @@ def show_settled(scene: ViewerScene, watched: Watched) -> Picture:
         scene.show(picture)
         if not picture.is_computing:
             break
-        assert watched.woken.wait(PATIENCE)
+        assert watched.woken.wait(PATIENCE_S)
     watched.now += 1  # for coloured meshes to be loaded
     scene.advance()
     return picture

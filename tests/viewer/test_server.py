@@ -6,18 +6,22 @@ import queue
 import socket
 import urllib.request
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from toy_avatar import ToyAvatar
-from toy_viewer import PATIENCE, SMALL
+from toy_viewer import PATIENCE_S, SMALL
 
 from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError
 from snarfcli.motions import Motion
+from snarfcli.viewer import server as server_module
 from snarfcli.viewer.joints import angles_of
 from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback
+from snarfcli.viewer.state import ViewerState
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
 
@@ -54,7 +58,7 @@ def server():
 
 
 def test_the_page_is_served_on_this_machine_only_and_needs_no_other(server):
-    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/", timeout=60) as answer:
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/", timeout=300) as answer:
         page = answer.read()
     assert answer.status == 200
     assert b"<html" in page
@@ -85,19 +89,29 @@ def test_what_one_changes_all_see(server):
             assert not server.state.posed.pose.any()
 
 
-def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(server):
+@pytest.fixture
+def clock(monkeypatch):
+    """The time of the viewers made from now on, seconds; it stands still unless the test changes `now`."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(server_module, "ViewerState", partial(ViewerState, clock=lambda: clock.now))
+    return clock
+
+
+def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(clock, server):
     with Page(server.server) as page:
         page.change("Motion", "bend")
         page.until(lambda message: message.get("updates", {}).get("label") == "Pause")
+        clock.now = 1.5 / 20  # in the middle of frame 1
         page.until_node("/avatar/plain", "vertices")
         frame = page.uuid("Frame")
-        page.until(lambda message: message.get("uuid") == frame and message["updates"].get("value", 0) > 0)
+        page.until(lambda message: message.get("uuid") == frame and message["updates"].get("value") == 1)
         page.change("Pause", True)
         page.until(lambda message: message.get("updates", {}).get("label") == "Play")
-        page.change("Frame", 0)
-        page.until(lambda message: message.get("uuid") == page.uuid("turn z"))
-        page.change("Frame", 3)
         turn = page.uuid("turn z")
+        page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == pytest.approx(17.2))
+        page.change("Frame", 0)
+        page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == 0)
+        page.change("Frame", 3)
         page.until(lambda message: message.get("uuid") == turn and message["updates"]["value"] == pytest.approx(51.6))
         assert server.state.posed.pose[1, 2] == pytest.approx(0.9)  # not that of the slider's whole tenths
         page.change("Motion", "broken")
@@ -176,7 +190,7 @@ def test_who_leaves_lets_go_of_the_handle(server, monkeypatch):
     monkeypatch.setattr(server.scene, "let_go", left.put)
     with Page(server.server):
         (client_id,) = server.server.get_clients()
-    assert left.get(timeout=PATIENCE) == client_id
+    assert left.get(timeout=PATIENCE_S) == client_id
 
 
 def test_an_avatar_without_weights_has_no_choice_of_surface():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from toy_avatar import LENGTH, RADIUS, ToyAvatar
-from toy_viewer import PATIENCE, SMALL, Watched
+from toy_viewer import PATIENCE_S, SMALL, Watched
 
 from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.motions import Motion
@@ -85,7 +85,7 @@ def test_a_field_is_made_for_the_latest_pose_only(watched, monkeypatch):
 
     def slow(request):
         begun.set()
-        assert go_on.wait(PATIENCE)
+        assert go_on.wait(PATIENCE_S)
         made.append(request.posed.pose[1, 2])
         return make(request)
 
@@ -94,7 +94,7 @@ def test_a_field_is_made_for_the_latest_pose_only(watched, monkeypatch):
     picture = watched.picture()
     assert picture.is_computing
     assert picture.mesh.surface == "skinned"
-    assert begun.wait(PATIENCE)
+    assert begun.wait(PATIENCE_S)
     for angle in (0.1, 0.2, 0.3):
         watched.state.turn_joint(1, angle * BEND / 0.9)
         assert watched.picture().mesh.posed.pose[1, 2] == pytest.approx(angle)

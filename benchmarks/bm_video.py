@@ -18,7 +18,7 @@ from snarfcli.motions import builtin_motion
 from snarfcli.parallel import count_cores
 from snarfcli.rendering import Camera, render, write_video
 from snarfcli.rendering.animation import Animation
-from snarfcli.rendering.floor import Backdrop, Ground
+from snarfcli.rendering.floor import Backdrop, Floor
 from snarfcli.rendering.lighting import Look, Solid
 from snarfcli.rendering.panels import Screen
 from snarfcli.rendering.pictures import make_pictures
@@ -48,13 +48,13 @@ def _pictures(options, avatar, motion) -> None:
     mesh = avatar.skinned_surface(options.resolution).posed(pose, shift)
     size, look = (options.size, options.size), Look()
     camera = Camera.framing(mesh.vertices)
-    still = Backdrop(camera, size, Ground(float(mesh.vertices[:, 1].min())), look)
+    still = Backdrop(camera, size, Floor(float(mesh.vertices[:, 1].min())), look)
     solid = Solid(mesh)
     cases = {
         "all anew": lambda: render(mesh, camera, size),
         "camera stands still": lambda: render(mesh, camera, size, backdrop=still),
         "another view of the same mesh": lambda: render(solid, camera, size, backdrop=still),
-        "floor with lines": lambda: Backdrop(camera, size, Ground(0.0, 0.5), look),
+        "floor with lines": lambda: Backdrop(camera, size, Floor(0.0, 0.5), look),
         "all anew, 12 rays to the sky": lambda: render(mesh, camera, size, look=Look(sky_rays=12)),
     }
     seconds = {name: timed(work, options.repeats) for name, work in cases.items()}

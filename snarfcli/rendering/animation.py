@@ -34,7 +34,7 @@ _TRUTH_COLOR = (204, 178, 148)  # sRGB; clay, to tell it from the avatar
 
 
 class GroundTruthMeshes(Protocol):
-    """Ground-truth meshes by frame: vertices [V, 3], metres, and faces [F, 3]."""
+    """Floor-truth meshes by frame: vertices [V, 3], metres, and faces [F, 3]."""
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]: ...
 
@@ -175,7 +175,7 @@ class Animation:
         surface = skinned_surface(self.avatar, self.resolution, self.keep_share)
         vertices = surface.canonical_vertices(torch.from_numpy(self.poses[index]).float())
         stage = self.screen.stage
-        placed = place_canonical(vertices, surface.mesh, stage.heading_rad, stage.ground.height)
+        placed = place_canonical(vertices, surface.mesh, stage.heading_rad, stage.floor.height)
         return replace(surface.mesh, vertices=placed, normals=None)
 
 

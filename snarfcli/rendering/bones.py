@@ -1,4 +1,4 @@
-"""A picture of meshes with the skeleton's bones drawn over them: do they belong together?"""
+"""A picture of meshes with the bones of a skeleton drawn over them, to check that they match."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _PANEL = 360  # pixels
 _VIEWS = (("from the front", 20.0), ("from the side", 100.0))
 _ELEVATION_RAD = math.radians(10)
 _BONE, _JOINT, _ROOT, _RIM = (235, 94, 40), (255, 214, 102), (200, 30, 120), (40, 20, 10)  # sRGB
-_LOOK = Look(body=(0.62, 0.68, 0.74))  # paler than usual, so that the bones stand out
+_LOOK = Look(body=(0.62, 0.68, 0.74))  # paler than usual, so that the bones are visible
 
 
 class BonedMesh(Protocol):

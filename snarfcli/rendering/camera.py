@@ -1,4 +1,4 @@
-"""A pinhole camera that knows how to keep things in the picture."""
+"""A pinhole camera, and how to place it so that given points are in the picture."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Camera:
     """A pinhole camera in a world with y up, in metres."""
 
     position: tuple[float, float, float]
-    """Where it stands."""
+    """Position of the camera."""
     target: tuple[float, float, float]
-    """The point in the middle of the picture."""
+    """Point in the middle of the picture."""
     fov_rad: float = math.radians(24)
-    """Opening angle along the picture's height; a long lens, so that limbs keep their proportions."""
+    """Angle of view along the height of the picture; small, so that limbs keep their proportions."""
 
     @classmethod
     def framing(
@@ -39,15 +39,16 @@ class Camera:
             aspect: width over height of the picture.
             azimuth_rad: direction of the camera seen from the points: 0 is +z, a quarter turn +x.
             elevation_rad: how far the camera looks down.
-            fov_rad: see the field.
-            margin: share of the picture kept free on each side.
+            fov_rad: angle of view along the height of the picture.
+            margin: share of the picture that stays empty on each side.
 
         Raises:
             ValueError: there are no points, or they are not finite.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         if not len(points) or not np.isfinite(points).all():
-            raise ValueError(f"points: wanted finite points [N, 3], got {len(points)} of which not all are finite")
+            bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
+            raise ValueError(f"points: wanted at least one finite point [N, 3], got {len(points)}, {bad} of them not finite")
         cos_elevation = math.cos(elevation_rad)
         backward = np.array(
             [math.sin(azimuth_rad) * cos_elevation, math.sin(elevation_rad), math.cos(azimuth_rad) * cos_elevation]
@@ -56,8 +57,8 @@ class Camera:
         target = (points.min(axis=0) + points.max(axis=0)) / 2
         slope_y = math.tan(fov_rad / 2) * (1 - 2 * margin)
         slope_x = slope_y * aspect
-        # Perspective makes near points spread more than far ones, so the middle is found by iteration; four rounds
-        # leave well under a pixel.
+        # In perspective near points spread more than far ones, so the middle is found by iteration; after four rounds the
+        # error is well below a pixel.
         for _ in range(4):
             offset = points - target
             x, y, z = offset @ right, offset @ up, offset @ backward
@@ -65,18 +66,22 @@ class Camera:
             depth = np.maximum(distance - z, 1e-6)
             middle = [(np.min(v / depth) + np.max(v / depth)) / 2 * distance for v in (x, y)]
             target = target + middle[0] * right + middle[1] * up
-        near = cls(tuple(map(float, target + backward)), tuple(map(float, target)), fov_rad)
+        near = cls(_triple(target + backward), _triple(target), fov_rad)
         return near.at(near.distance_to_see(points, aspect=aspect, margin=margin))
 
     def distance_to_see(self, points: np.ndarray, *, aspect: float = 1.0, margin: float = 0.07) -> float:
-        """Return how far from its target the camera must be to have all points [N, 3] in the picture; see `framing`."""
+        """Return the distance from the target, metres, at which all points [N, 3] are in the picture; see `framing`."""
         slope_y = math.tan(self.fov_rad / 2) * (1 - 2 * margin)
         x, y, z = self.axes @ (np.asarray(points, dtype=np.float64) - self.target).T
         return max(float((z + np.maximum(np.abs(x) / (slope_y * aspect), np.abs(y) / slope_y)).max()), 1e-3)
 
     def at(self, distance: float) -> Camera:
         """Return the camera at another distance from its target, metres."""
-        return replace(self, position=tuple(map(float, self.target + distance * self.axes[2])))
+        return replace(self, position=_triple(self.target + distance * self.axes[2]))
+
+    def between(self, position: np.ndarray, target: np.ndarray) -> Camera:
+        """Return the camera at another position [3] with another target [3], metres."""
+        return replace(self, position=_triple(position), target=_triple(target))
 
     @property
     def axes(self) -> np.ndarray:
@@ -84,7 +89,7 @@ class Camera:
         backward = np.subtract(self.position, self.target, dtype=np.float64)
         length = np.linalg.norm(backward)
         if not length > 0:
-            raise ValueError(f"camera: position and target are the same point {self.target}")
+            raise ValueError(f"camera: wanted different points as position and target, got {self.target} for both")
         backward = backward / length
         return np.stack([*_right_up(backward), backward])
 
@@ -106,6 +111,12 @@ class Camera:
         length = np.sqrt((across.T**2 + 1).astype(np.float32) + (upward**2).astype(np.float32))
         directions /= length[..., None]
         return directions.reshape(-1, 3)
+
+
+def _triple(point: np.ndarray) -> tuple[float, float, float]:
+    """Return a point [3] as three floats."""
+    x, y, z = map(float, point)
+    return x, y, z
 
 
 def _right_up(backward: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

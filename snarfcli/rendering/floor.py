@@ -1,8 +1,7 @@
-"""The floor that a body stands on, the backdrop that it fades to, and the shadow that the body throws on it.
+"""The floor below a body, the backdrop that it fades to, and the shadow of the body on it.
 
-DESIGN. The floor is an analytic plane. Everything but the shadow depends on the camera alone, so a camera that stands still
-keeps it from picture to picture. The shadow is computed on a coarse grid around the body, and only the pixels that see this
-part of the floor are changed.
+DESIGN. The floor is an analytic plane. All but the shadow depends on the camera alone, so for a fixed camera it is computed
+once. The shadow is computed on a coarse grid around the body, and changes only the pixels that see this part of the floor.
 """
 
 from __future__ import annotations
@@ -16,50 +15,50 @@ from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 from snarfcli.rendering.camera import Camera
 from snarfcli.rendering.lighting import PATTERN, LitScene, Look
 
-__all__ = ["Backdrop", "Ground"]
+__all__ = ["Backdrop", "Floor"]
 
 _CELLS = 112  # shadow grid, each way: 2 to 3 cm for a standing body
 _LINE_SHARE = 0.014  # width of a line of the floor's pattern over its spacing
-_LINE_SHADE = 0.17  # how much darker a line is: to be seen when it moves, not to be looked at
+_LINE_SHADE = 0.17  # how much darker a line is: visible in motion, but not distracting
 
 
 @dataclass(frozen=True)
-class Ground:
-    """Where the floor is and what it looks like."""
+class Floor:
+    """Height and pattern of the floor."""
 
     height: float
     """Metres."""
     spacing: float | None = None
-    """Metres between the lines of a faint pattern, which shows how a body or the camera moves; None leaves the floor plain."""
+    """Metres between the lines of a faint pattern, which makes motion visible; None for a plain floor."""
 
 
 class Backdrop:
-    """The empty stage as one camera sees it; pictures of one size are drawn before it."""
+    """The empty stage seen by one camera, as the background of pictures of one size."""
 
-    def __init__(self, camera: Camera, size: tuple[int, int], ground: Ground, look: Look) -> None:
-        self.camera, self.size, self.ground, self.look = camera, size, ground, look
+    def __init__(self, camera: Camera, size: tuple[int, int], floor: Floor, look: Look) -> None:
+        self.camera, self.size, self.floor, self.look = camera, size, floor, look
         width, height = size
         x, y = np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32) + 0.5
         view = camera.rays(x, y, width, height)
         position, target = (np.asarray(place, dtype=np.float32)[[0, 2]] for place in (camera.position, camera.target))
-        above = np.float32(camera.position[1] - ground.height)
+        above = np.float32(camera.position[1] - floor.height)
         meets = (view[:, 1] < -1e-4) & (above > 0)
         distance = np.where(meets, above / np.where(meets, -view[:, 1], 1), np.float32(1e6))
-        # Relative to the target, where float32 is precise.
+        # Relative to the target, so that float32 is precise.
         away = view[:, [0, 2]] * distance[:, None] + (position - target)
-        # A pool of light that fades into the backdrop, so that no horizon shows.
+        # The light fades into the backdrop, so that there is no horizon.
         reach = np.float32(np.linalg.norm(np.subtract(camera.position, camera.target)))
         fade = np.clip((np.sqrt(away[:, 0] ** 2 + away[:, 1] ** 2) / reach - np.float32(0.12)) / np.float32(0.75), 0, 1)
         fade = np.where(meets, fade * fade * (3 - 2 * fade), 1)[:, None]
         distant = np.asarray(look.backdrop, dtype=np.float32) * (1.02 - 0.10 * (y / height)).repeat(width)[:, None] * fade
-        floor = np.asarray(look.floor, dtype=np.float32) * (1 - fade)
-        if ground.spacing is not None:
-            floor *= (1 - _LINE_SHADE * _lines(away.reshape(height, width, 2), target, ground.spacing)).reshape(-1, 1)
+        lit = np.asarray(look.floor, dtype=np.float32) * (1 - fade)
+        if floor.spacing is not None:
+            lit *= (1 - _LINE_SHADE * _lines(away.reshape(height, width, 2), target, floor.spacing)).reshape(-1, 1)
         self._place = away
         self._target = target.astype(np.float64)
-        self._empty = (floor + distant).astype(np.float32)
-        # What full shadow takes away; far off, where the floor fades, there is none.
-        self._drop = (floor + distant * (1 - fade)).astype(np.float32)
+        self._empty = (lit + distant).astype(np.float32)
+        # Light lost in full shadow; none far away, where the floor fades.
+        self._drop = (lit + distant * (1 - fade)).astype(np.float32)
 
     def picture(self, scene: LitScene | None) -> np.ndarray:
         """Return the stage [H * W, 3] float32, linear colour, with the shadow of the scene on the floor."""
@@ -77,12 +76,12 @@ class Backdrop:
 
 
 def _lines(away: np.ndarray, target: np.ndarray, spacing: float) -> np.ndarray:
-    """Return how much of each pixel [H, W] a grid of lines covers, box-filtered so that far lines do not flicker."""
+    """Return the share of each pixel [H, W] covered by a grid of lines, box-filtered so that far lines do not flicker."""
     half = np.float32(spacing * _LINE_SHARE / 2)
     cover = np.zeros(away.shape[:2], dtype=np.float32)
     for axis in range(2):
         place = away[..., axis]
-        # Width of the pixel on the floor across these lines.
+        # Width of a pixel on the floor, across these lines.
         wide = sum(np.abs(step) for step in np.gradient(place)) if min(place.shape) > 1 else np.full_like(place, spacing)
         wide = np.maximum(wide, np.float32(1e-6))
         shifted = place + np.float32(math.fmod(float(target[axis]), spacing)) + np.float32(spacing / 2)
@@ -93,7 +92,7 @@ def _lines(away: np.ndarray, target: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _shadow(scene: LitScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the light on the floor around the mesh: a grid [X, Z] of shares, its lower corner and cell size, metres."""
+    """Return the share of light on the floor around the mesh as a grid [X, Z], its lower corner and its cell size, metres."""
     low, high = scene.solid.mesh.bounds
     tall = max(float(high[1]) - scene.floor_y, 0.05)
     thrown = -scene.key[[0, 2]] / scene.key[1] * tall
@@ -109,9 +108,9 @@ def _shadow(scene: LitScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     dome, key = scene.gather(points, normals, phase, floor=False)
     grid = np.stack([dome.mean(axis=1), key]).reshape(2, _CELLS, _CELLS)
     grid = np.stack([gaussian_filter(uniform_filter(g, PATTERN, mode="nearest"), 0.9) for g in grid])
-    dome = np.minimum(grid[0] / np.percentile(grid[0], 90), 1)  # the farthest tenth counts as open
+    dome = np.minimum(grid[0] / np.percentile(grid[0], 90), 1)  # the brightest tenth counts as unshaded
     light = 0.58 * dome**1.6 + 0.42 * grid[1]
-    # The border of the grid must be unshaded, or its edge would show on the floor.
+    # The border of the grid must be unshaded, or its edge would be visible on the floor.
     edge = np.minimum(np.arange(_CELLS), np.arange(_CELLS)[::-1]) / (0.2 * _CELLS)
     inner = np.minimum(np.minimum.outer(edge, edge), 1)
     return (1 - (1 - light) * inner * inner * (3 - 2 * inner)).astype(np.float32), lower, cell

@@ -1,4 +1,4 @@
-"""What a picture of a video is put together from: panels side by side, of several contents and views, with labels below."""
+"""Pictures of several panels, one per content and view, side by side with labels below."""
 
 from __future__ import annotations
 
@@ -19,42 +19,42 @@ from snarfcli.rendering.stage import Stage
 __all__ = ["LARGEST_SIDE", "Screen", "picture_size"]
 
 LARGEST_SIDE = 8192
-"""Pixels each way of a whole picture: twice what many players show."""
+"""Maximum width and height of a picture, pixels: twice what many players show."""
 _MOST_PIXELS = 4096 * 4096
 _LOOK = Look()
 _SEAM = (255, 255, 255)
 
 
 def picture_size(size: tuple[int, int], contents: int, views: int) -> tuple[int, int]:
-    """Return the pixels, (width, height), of a picture with panels of `size`.
+    """Return the size, (width, height) in pixels, of a picture with panels of `size`.
 
     Raises:
-        UserError: it is larger than a video may be.
+        UserError: it is larger than the maximum size of a video.
     """
     columns, rows = _layout(contents, views)
     strip = 0 if contents * views == 1 else text_strip(["x"], size[0]).shape[0]
     width, height = columns * size[0] + columns - 1, rows * (size[1] + strip)
     if max(width, height) > LARGEST_SIDE or width * height > _MOST_PIXELS:
         raise UserError(
-            f"{contents * views} panels of {size[0]} x {size[1]} pixels make a picture of {width} x {height}, more than"
-            " 4096 x 4096 pixels or 8192 one way; give a smaller video_size, which is that of one panel"
+            f"video_size: wanted a picture of at most 4096 x 4096 pixels and {LARGEST_SIDE} one way, got {width} x {height} of"
+            f" {contents * views} panels of {size[0]} x {size[1]}; give a smaller video_size, which is that of one panel"
         )
     return width, height
 
 
 def _layout(contents: int, views: int) -> tuple[int, int]:
-    """Return columns and rows: all in one row, or contents below each other if there are several views of each."""
+    """Return the number of columns and rows: one row, or one row per content if there are several views."""
     return (views, contents) if min(contents, views) > 1 else (contents * views, 1)
 
 
 class Screen:
-    """Panels and the cameras in front of them.
+    """Draws pictures of panels, each with its camera.
 
     Args:
         stage: cameras and floor.
-        size: pixels, (width, height), of one panel.
-        contents: what each row or column shows, and what to call it.
-        settled: contents that stay where they are, over x = z = 0, whatever the body does.
+        size: (width, height) of one panel, pixels.
+        contents: content of each row or column, and its label.
+        settled: contents that stay at x = z = 0 while the body moves.
     """
 
     def __init__(self, stage: Stage, size: tuple[int, int], contents: Mapping[str, str], settled: Sequence[str] = ()) -> None:
@@ -63,15 +63,15 @@ class Screen:
         self._backdrops: dict[tuple[int, bool], Backdrop] = {}
 
     def __getstate__(self) -> dict:
-        """Leave out what was prepared: it is large and quickly made again."""
+        """Leave out cached images, which are large and fast to compute."""
         return {**{name: value for name, value in vars(self).items() if name != "_strips"}, "_backdrops": {}}
 
     def draw(self, frame: int, shown: Mapping[str, Mesh | None]) -> np.ndarray:
         """Draw one frame.
 
         Args:
-            frame: which one.
-            shown: what to show as each of the contents; None leaves its stage empty.
+            frame: number of the frame.
+            shown: mesh of each content; None leaves its stage empty.
 
         Returns:
             [H, W, 3] uint8, sRGB.
@@ -94,7 +94,7 @@ class Screen:
 
     @cached_property
     def _strips(self) -> list[np.ndarray]:
-        """The labels below each row of panels, [H, W, 3]."""
+        """Labels below each row of panels, [H, W, 3]."""
         views = [view.label for view in self.stage.views]
         if len(views) == 1:
             labels = list(self.contents.values())
@@ -105,12 +105,12 @@ class Screen:
         return [text_strip(labels[row * self.columns :][: self.columns], self.size[0]) for row in range(self.rows)]
 
     def _backdrop(self, view: int, frame: int, is_settled: bool) -> Backdrop:
-        """Return the empty stage of a view, which is kept as long as its camera stands still."""
+        """Return the empty stage of a view, cached while its camera does not move."""
         known = self._backdrops.get((view, is_settled))
         if known is not None and self.stage.is_still:
             return known
         camera = self._camera(view, frame, is_settled)
-        backdrop = Backdrop(camera, self.size, self.stage.ground, _LOOK)
+        backdrop = Backdrop(camera, self.size, self.stage.floor, _LOOK)
         if self.stage.is_still:
             self._backdrops[view, is_settled] = backdrop
         return backdrop

@@ -1,10 +1,10 @@
 """Pictures of meshes by ray casting with Embree: no display, no OpenGL.
 
-DESIGN. Primary rays are cast only inside the mesh's box on the screen, `supersample` squared a pixel. Light comes from a sky
-dome and a large key light, both tested for occlusion with a few rays a pixel; neighbouring pixels turn the same
-directions differently and a small blur joins them, so that 12 rays look like a hundred. What does not change from picture
-to picture is kept: a `Solid` serves several cameras, a `Backdrop` all pictures of a camera that stands still. A body at
-512 x 512 takes a fifth of a second of one core (benchmarks/bm_video.py).
+DESIGN. Primary rays are cast only inside the bounding box of the mesh on the screen, `supersample` squared per pixel. Light
+comes from a sky dome and a large key light, both tested for occlusion with a few rays per pixel; neighbouring pixels use
+different directions and a small blur averages them, so that 12 rays look like a hundred. Constant parts are kept from picture
+to picture: a `Solid` serves several cameras, a `Backdrop` all pictures of a fixed camera. A body at 512 x 512 takes a fifth of
+a second of one core (benchmarks/bm_video.py).
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from scipy.ndimage import uniform_filter
 from snarfcli.meshing.colors import from_srgb
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.rendering.camera import Camera
-from snarfcli.rendering.floor import Backdrop, Ground
+from snarfcli.rendering.floor import Backdrop, Floor
 from snarfcli.rendering.lighting import PATTERN, LitScene, Look, Solid, dot
 
 __all__ = ["Look", "render"]
 
 _LOOK = Look()
-_KNEE = 0.8  # linear colour from which highlights roll off instead of clipping
-_BRIGHTEST = 4.0  # beyond it nothing changes any more in 8 bits
+_KNEE = 0.8  # linear colour above which highlights are compressed instead of clipped
+_BRIGHTEST = 4.0  # linear colour above which the 8-bit colour is constant
 
 
 def render(
@@ -38,13 +38,13 @@ def render(
     """Draw a mesh on a plain floor.
 
     Args:
-        mesh: its colours are used as albedo if it has any; None draws the empty stage. A `Solid` for several pictures.
-        camera: where from.
+        mesh: its colours, if any, are the albedo; None draws the empty stage. A `Solid` is faster for several pictures.
+        camera: position and view.
         size: pixels, (width, height) or one number for both.
         floor_y: height of the floor, metres; the lowest vertex by default.
-        supersample: rays along each side of a pixel.
+        supersample: number of rays along each side of a pixel.
         look: colours and lights.
-        backdrop: what was prepared for this camera, size and look, with a floor of its own.
+        backdrop: prepared background for this camera, size and look; it has its own floor.
 
     Returns:
         [height, width, 3] uint8, sRGB.
@@ -54,16 +54,16 @@ def render(
     """
     width, height = (size, size) if isinstance(size, int) else size
     if width < 1 or height < 1 or supersample < 1:
-        raise ValueError(f"size: wanted positive numbers, got {width} x {height} pixels of {supersample} rays a side")
+        raise ValueError(f"size: wanted positive numbers, got {width} x {height} pixels and supersample={supersample}")
     if isinstance(mesh, Mesh):
         mesh = Solid(mesh) if len(mesh.faces) else None
     if backdrop is None:
         if floor_y is None:
             floor_y = float(mesh.mesh.vertices[:, 1].min()) if mesh is not None else 0.0
-        backdrop = Backdrop(camera, (width, height), Ground(floor_y), look)
+        backdrop = Backdrop(camera, (width, height), Floor(floor_y), look)
     elif (backdrop.camera, backdrop.size, backdrop.look) != (camera, (width, height), look) or floor_y is not None:
-        raise ValueError("backdrop: wanted one for this camera, size and look, which brings its own floor")
-    scene = None if mesh is None else LitScene(mesh, camera, backdrop.ground.height, look)
+        raise ValueError("backdrop: wanted one for this camera, size and look, and no floor_y, got another one or floor_y")
+    scene = None if mesh is None else LitScene(mesh, camera, backdrop.floor.height, look)
     picture = backdrop.picture(scene)
     if scene is not None:
         pixel, color = _draw(scene, width, height, supersample)
@@ -76,7 +76,7 @@ def render(
 
 
 def _draw(scene: LitScene, width: int, height: int, supersample: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixel [M] that each ray which hits belongs to and the colour [M, 3] it sees, linear."""
+    """Return the pixel [M] and the linear colour [M, 3] of each ray that hits the mesh."""
     camera, solid = scene.camera, scene.solid
     mesh = solid.mesh
     low, high = _screen_box(scene, width, height)
@@ -97,11 +97,11 @@ def _draw(scene: LitScene, width: int, height: int, supersample: int) -> tuple[n
 
     points, normals = blend(mesh.vertices), blend(solid.normals)
     normals /= np.sqrt(np.maximum(dot(normals, normals), 1e-12))
-    # Inner sides of open meshes, and smooth normals that look away at the silhouette.
+    # Flip normals on inner sides of open meshes; smooth normals may point slightly away at the silhouette.
     normals = np.where(dot(normals, view) > 0.25, -normals, normals)
     albedo = np.asarray(scene.look.body, dtype=np.float32) if mesh.colors is None else blend(from_srgb(mesh.colors))
 
-    # Light is gathered once a pixel and spread to its other samples.
+    # Light is gathered once per pixel and used for all its samples.
     pixel_x, pixel_y = sample_x // supersample - low[0], sample_y // supersample - low[1]
     box = (high[1] - low[1], high[0] - low[0])
     flat = pixel_y * box[1] + pixel_x
@@ -126,7 +126,7 @@ def _shade(
 ) -> np.ndarray:
     """Return the colour of surface points [M, 3]: diffuse dome and key, a rim light, a broad soft highlight."""
     facing = np.maximum(-dot(normals, view), 0)
-    # Wrapped a little around the terminator, as skin and clay do.
+    # Light wraps a little around the terminator, as on skin and clay.
     key = np.maximum((normals @ scene.key)[:, None] + 0.12, 0) / 1.12
     half = scene.key - view
     half /= np.sqrt(dot(half, half))
@@ -150,12 +150,12 @@ def _screen_box(scene: LitScene, width: int, height: int) -> tuple[np.ndarray, n
 
 
 def _to_srgb(color: np.ndarray) -> np.ndarray:
-    """Return sRGB bytes of linear colour; highlights roll off instead of clipping."""
+    """Return linear colour as sRGB bytes; highlights are compressed instead of clipped."""
     return _SRGB[(color.clip(0, _BRIGHTEST) * ((len(_SRGB) - 1) / _BRIGHTEST) + 0.5).astype(np.intp)]
 
 
 def _srgb_table(count: int = 2**16) -> np.ndarray:
-    """Return the sRGB bytes [count] of linear colours from 0 to the brightest; so many tell all bytes but the darkest apart."""
+    """Return the sRGB bytes [count] of linear colours from 0 to the brightest; 2^16 resolve all but the darkest bytes."""
     color = np.linspace(0, _BRIGHTEST, count)
     over = np.maximum(color - _KNEE, 0)
     color = np.where(color > _KNEE, _KNEE + (1 - _KNEE) * (1 - np.exp(-over / (1 - _KNEE))), color)

@@ -25,20 +25,20 @@ def contact_sheet(
     captions: Sequence[Sequence[str | None]] | None = None,
     title: str | None = None,
 ) -> np.ndarray:
-    """Lay pictures out in a grid.
+    """Arrange pictures in a grid.
 
     Args:
-        rows: pictures [H, W, 3] uint8, all of one size; None leaves a place empty.
-        row_labels: a line above each row.
-        column_labels: a line above each column.
-        captions: a line below each picture.
-        title: a line on top.
+        rows: pictures [H, W, 3] uint8, all of one size; None leaves a cell empty.
+        row_labels: one line above each row.
+        column_labels: one line above each column.
+        captions: one line below each picture.
+        title: one line at the top.
 
     Returns:
         [H', W', 3] uint8. Labels that are too wide are shortened.
 
     Raises:
-        ValueError: there are no pictures, sizes differ, or the numbers of labels and pictures do not fit together.
+        ValueError: there are no pictures, sizes differ, or the number of labels does not match that of the pictures.
     """
     from PIL import Image, ImageDraw
 
@@ -54,7 +54,8 @@ def contact_sheet(
         if labels is not None and len(labels) != wanted:
             raise ValueError(f"{name}: wanted {wanted} labels, got {len(labels)}")
     if captions is not None and [len(line) for line in captions] != [len(row) for row in rows]:
-        raise ValueError("captions: wanted one for each picture, row by row")
+        got = [len(line) for line in captions]
+        raise ValueError(f"captions: wanted one for each picture, {[len(row) for row in rows]} by rows, got {got}")
 
     small, large = _font(min(max(12, width // 24), 20)), _font(min(max(15, width // 17), 28))
     line_s, line_l = _line(small), _line(large)
@@ -87,9 +88,9 @@ def contact_sheet(
 
 
 def text_strip(labels: Sequence[str], part: int) -> np.ndarray:
-    """Return a strip of paper, [H, W, 3] uint8, with the labels centred on parts of `part` pixels, one pixel between them.
+    """Return a strip [H, W, 3] uint8 with the labels centred on parts of `part` pixels, one pixel between them.
 
-    Labels that are too wide are shortened; the height depends on `part` alone.
+    Labels that are too wide are shortened. The height depends on `part` only.
     """
     from PIL import Image, ImageDraw
 
@@ -118,13 +119,13 @@ def _font(size: int):
 
 
 def _line(font) -> int:
-    """Return the height of a line of text with room around it, pixels."""
+    """Return the height of a line of text with its margin, pixels."""
     ascent, descent = font.getmetrics()
     return ascent + descent + 6
 
 
 def _shortened(text: str, font, room: int) -> str:
-    """Return the text, cut and ended with dots if it is wider than `room` pixels."""
+    """Return the text, shortened with dots at its end if it is wider than `room` pixels."""
     if font.getlength(text) <= room:
         return text
     while text and font.getlength(text + "...") > room:

@@ -1,10 +1,10 @@
-"""The stage of a sequence: where the cameras and the floor are in each frame, found before the first one is drawn."""
+"""The stage of a sequence: cameras and floor in each frame, computed before the first frame is drawn."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,41 +12,41 @@ import torch
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.rendering.camera import Camera
-from snarfcli.rendering.floor import Ground
+from snarfcli.rendering.floor import Floor
 from snarfcli.rendering.views import View
 
 __all__ = ["CAMERAS", "Stage", "body_points", "set_stage"]
 
 CAMERAS = ("still", "follow")
-"""A camera that stands and sees the whole motion, and one that goes along with the body."""
+"""A fixed camera that sees the whole motion, and one that follows the body."""
 
-# Points posed in all frames together, and in one frame: a body is covered to within 2 cm by 3000.
+# Points posed in all frames together, and in one frame; 3000 points are at most 2 cm apart on a body.
 _POINTS_IN_ALL = 600_000
 _POINTS_LEAST, _POINTS_MOST = 300, 3000
-_FOLLOW_S = 0.4  # standard deviation: steps and swinging arms are smoothed away, a change of direction is not
-_TURNS = 24  # ways round, at which a turntable's picture must hold the body
+_FOLLOW_S = 0.4  # standard deviation: smooths out steps and swinging arms, but not a change of direction
+_TURNS = 24  # angles at which a turntable must show the whole body
 _HULL = 4000  # points that are turned
-_LINES = 4  # lines of the floor's pattern over the body's height, about
+_LINES = 4  # approximate number of lines of the floor over the height of the body
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """Cameras that share one distance, so that sizes compare between views, and a floor."""
+    """A floor, and cameras at the same distance, so that sizes are comparable between views."""
 
     views: tuple[View, ...]
-    """What they are asked to see."""
+    """Sides to look from."""
     cameras: tuple[Camera, ...]
-    """One for each view, before it moves."""
+    """One for each view, at its start."""
     pivot: np.ndarray
-    """[3] metres, what a turntable's camera goes round."""
-    ground: Ground
+    """[3] metres, centre of a turntable."""
+    floor: Floor
     """The floor, at the lowest point of the sequence."""
     shifts: np.ndarray
-    """[T, 3] metres, how far the cameras have gone along with the body."""
+    """[T, 3] metres, by which the cameras have followed the body."""
     turns_rad: np.ndarray
-    """[T], how far the cameras have gone round it."""
+    """[T] angles by which the cameras have turned about the pivot."""
     heading_rad: float
-    """Direction that the body faces on average, 0 for +z."""
+    """Mean direction of the body, 0 for +z."""
 
     @property
     def is_still(self) -> bool:
@@ -57,11 +57,11 @@ class Stage:
         """Return the camera of one view in one frame."""
         start, turn = self.cameras[view], _turned(float(self.turns_rad[frame]))
         moved = [self.pivot + turn @ np.subtract(place, self.pivot) for place in (start.position, start.target)]
-        position, target = (tuple(map(float, place + self.shifts[frame])) for place in moved)
-        return replace(start, position=position, target=target)
+        position, target = (place + self.shifts[frame] for place in moved)
+        return start.between(position, target)
 
     def camera_on(self, view: int, frame: int, middle: np.ndarray) -> Camera:
-        """Return the camera of one view for something that stays over `middle` [3], from as far and as high."""
+        """Return the camera of one view, moved to look at `middle` [3] from the same distance and height."""
         camera = self.camera(view, frame)
         return _aimed(camera, np.array([middle[0], camera.target[1], middle[2]]))
 
@@ -74,14 +74,14 @@ def body_points(
     canonical_mesh: Mesh | None = None,
     bone_transforms: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return points that cover the body in each frame, [T, K, 3] metres.
+    """Return points on the body in each frame, [T, K, 3] metres.
 
     Args:
-        avatar: poses the body.
+        avatar: the body.
         poses: [T, J, 3] axis-angle, radians, y up, global orientation included.
         translation: [T, 3] metres.
-        canonical_mesh: the body, moved by its skin; without it the corners of the wider posed boxes are taken.
-        bone_transforms: [T, J, 4, 4] canonical to posed, metres, instead of those of the poses.
+        canonical_mesh: vertices to pose by skinning; without it the corners of the larger posed boxes are returned.
+        bone_transforms: [T, J, 4, 4], canonical to posed, metres; by default those of the poses.
     """
     points_c = None
     if canonical_mesh is not None:
@@ -114,18 +114,18 @@ def set_stage(
     also: np.ndarray | None = None,
     beside: np.ndarray | None = None,
 ) -> Stage:
-    """Find cameras that see the body in all frames, from the side that it mostly faces, and the floor below it.
+    """Find cameras that see the body in all frames, relative to its mean direction, and the floor below it.
 
     Args:
-        points: [T, K, 3] metres, what must be seen (`body_points`).
-        poses: [T, J, 3] axis-angle, radians, global orientation first, which says where the body faces.
+        points: [T, K, 3] metres, points of the body that must be in the picture (`body_points`).
+        poses: [T, J, 3] axis-angle, radians, global orientation first, which gives the direction of the body.
         views: sides to look from.
-        frame_rate: frames a second.
+        frame_rate: frames per second.
         aspect: width over height of one picture.
         camera: one of `CAMERAS`.
-        turn_rad_s: how fast the camera goes round the body.
-        also: [T, N, 3] metres, what must be seen too, but is not followed.
-        beside: [N, 3] metres, something that stands beside it and must fit into a picture of its own; around x = z = 0.
+        turn_rad_s: speed of the camera around the body.
+        also: [T, N, 3] metres, more points that must be in the picture, but are not followed.
+        beside: [N, 3] metres, points of an object around x = z = 0 that must fit into a separate picture.
     """
     heading_rad = _heading_rad(poses)
     middle = points.mean(axis=1) * (1, 0, 1)
@@ -164,7 +164,7 @@ def set_stage(
         tuple(views),
         tuple(cameras),
         pivot,
-        Ground(float(points[..., 1].min()), _round_number(tall / _LINES) if moves else None),
+        Floor(float(points[..., 1].min()), _round_number(tall / _LINES) if moves else None),
         shifts,
         turn_rad_s * np.arange(len(points)) / frame_rate,
         heading_rad,
@@ -172,25 +172,24 @@ def set_stage(
 
 
 def _aimed(camera: Camera, target: np.ndarray) -> Camera:
-    """Return the camera moved aside so that it looks at another point the same way."""
-    position = target + np.subtract(camera.position, camera.target)
-    return replace(camera, position=tuple(map(float, position)), target=tuple(map(float, target)))
+    """Return the camera moved so that it looks at another point in the same direction."""
+    return camera.between(target + np.subtract(camera.position, camera.target), target)
 
 
 def _smooth(places: np.ndarray, frame_rate: float) -> np.ndarray:
-    """Return the way [T, 3] without its shaking; at the ends it goes on as it came."""
+    """Return a smoothed path [T, 3]; at its ends the path is extended by point reflection."""
     from scipy.ndimage import gaussian_filter1d
 
     sigma = _FOLLOW_S * frame_rate
     room = math.ceil(4 * sigma)
     if len(places) < 2:
         return places.copy()
-    longer = np.pad(places, ((room, room), (0, 0)), mode="reflect", reflect_type="odd")
+    longer = np.pad(places, np.array([(room, room), (0, 0)]), mode="reflect", reflect_type="odd")
     return gaussian_filter1d(longer, sigma, axis=0, mode="nearest")[room:-room]
 
 
 def _all_ways_round(points: np.ndarray, pivot: np.ndarray) -> np.ndarray:
-    """Return points [N, 3] turned about the vertical through `pivot`, at most some thousand of them, all ways round."""
+    """Return a subset of points [N, 3] turned about the vertical through `pivot` by angles all around."""
     some = points[:: max(1, len(points) // _HULL)] - pivot
     turns = [_turned(2 * math.pi * turn / _TURNS) for turn in range(_TURNS)]
     return np.concatenate([some @ turn.T + pivot for turn in turns])
@@ -209,7 +208,7 @@ def _round_number(value: float) -> float:
 
 
 def _heading_rad(poses: np.ndarray) -> float:
-    """Return the direction that the body faces on average, 0 for +z; 0 too if it faces all ways."""
+    """Return the mean direction of the body, 0 for +z; 0 also if the body turns all around."""
     from scipy.spatial.transform import Rotation
 
     ahead = Rotation.from_rotvec(poses[:, 0]).apply((0.0, 0.0, 1.0)).mean(axis=0)

@@ -1,4 +1,4 @@
-"""The sides that a body is looked at from, by name or in degrees."""
+"""Views of a body, by name or in degrees."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from snarfcli.errors import UserError, nearest
 __all__ = ["VIEWS", "View", "parse_turntable", "parse_views"]
 
 VIEWS = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0, "top": 0.0}
-"""Degrees of the named views from straight ahead of the body towards its left; top looks down, its front below."""
+"""Degrees of the named views, from the front of the body towards its left; top looks down, with the front below."""
 
-_TOP_RAD = math.radians(89.5)  # not 90: then nothing would say which way the picture is turned
+_TOP_RAD = math.radians(89.5)  # not 90, which would leave the rotation of the picture undefined
 _MOST_VIEWS = 8
-_TURN_DEG = 45.0  # a second: a turn takes eight seconds, slow enough to follow
+_TURN_DEG = 45.0  # per second: a turn takes eight seconds, slow enough to follow
 _FASTEST_DEG = 720.0
 
 
@@ -25,11 +25,11 @@ class View:
     """A side to look from."""
 
     label: str
-    """What is written below its picture."""
+    """Label below its picture."""
     azimuth_rad: float
-    """Where the camera stands, seen from the body: 0 is straight ahead of it, a quarter turn its left."""
+    """Direction of the camera seen from the body: 0 is its front, a quarter turn its left."""
     elevation_rad: float
-    """How far the camera looks down."""
+    """Angle by which the camera looks down."""
 
     @property
     def is_from_above(self) -> bool:
@@ -38,18 +38,18 @@ class View:
 
 
 def parse_views(names: Sequence[str], azimuth_deg: float = 0.0, elevation_deg: float = 0.0) -> tuple[View, ...]:
-    """Return the views of their names.
+    """Return views by their names.
 
     Args:
-        names: of `VIEWS`, or degrees such as 45 and -30.
-        azimuth_deg: added to all, except top.
-        elevation_deg: how far the camera looks down in all, except top.
+        names: names in `VIEWS`, or degrees such as 45 and -30.
+        azimuth_deg: angle that is added to all views except top.
+        elevation_deg: angle by which the camera looks down in all views except top.
 
     Raises:
-        UserError: there are none, too many, or one is unknown or there twice.
+        UserError: there are none or too many, or one is unknown or repeated.
     """
     if not 1 <= len(names) <= _MOST_VIEWS:
-        raise UserError(f"views must be 1 to {_MOST_VIEWS} of {', '.join(VIEWS)} or degrees, got {len(names)}")
+        raise UserError(f"views: wanted 1 to {_MOST_VIEWS} of {', '.join(VIEWS)} or degrees, got {len(names)}")
     views = []
     for name in names:
         name = str(name).strip()
@@ -59,9 +59,9 @@ def parse_views(names: Sequence[str], azimuth_deg: float = 0.0, elevation_deg: f
             label, degrees = f"{float(name):g}°", float(name)
         else:
             hint = nearest(name, VIEWS)
-            raise UserError(f"views must be {', '.join(VIEWS)} or degrees from -360 to 360, got '{name}'{hint}")
+            raise UserError(f"views: wanted {', '.join(VIEWS)} or degrees from -360 to 360, got '{name}'{hint}")
         if label in [view.label for view in views]:
-            raise UserError(f"views has '{name}' twice; name each view once")
+            raise UserError(f"views: wanted each view once, got '{name}' twice; remove one")
         is_top = name == "top"
         azimuth_rad = math.radians(degrees if is_top else degrees + azimuth_deg)
         views.append(View(label, azimuth_rad, _TOP_RAD if is_top else math.radians(elevation_deg)))
@@ -69,10 +69,10 @@ def parse_views(names: Sequence[str], azimuth_deg: float = 0.0, elevation_deg: f
 
 
 def parse_turntable(text: str) -> float:
-    """Return the radians a second that the camera goes round: of false, true, or degrees a second.
+    """Return the speed of a turntable in radians per second, from true, false or a number of degrees per second.
 
     Raises:
-        UserError: it is none of them, or too fast to look at.
+        UserError: it is none of them, or too fast.
     """
     word = str(text).strip().lower()
     if word in ("true", "false"):
@@ -82,5 +82,5 @@ def parse_turntable(text: str) -> float:
     except ValueError:
         degrees = math.nan
     if not abs(degrees) <= _FASTEST_DEG:
-        raise UserError(f"turntable must be true, false or degrees a second up to {_FASTEST_DEG:g}, got '{text}'")
+        raise UserError(f"turntable: wanted true, false or at most {_FASTEST_DEG:g} degrees per second, got '{text}'")
     return math.radians(degrees)

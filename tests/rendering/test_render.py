@@ -8,7 +8,7 @@ import trimesh
 
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.rendering.camera import Camera
-from snarfcli.rendering.floor import Backdrop, Ground
+from snarfcli.rendering.floor import Backdrop, Floor
 from snarfcli.rendering.lighting import Look, Solid
 from snarfcli.rendering.render import render
 
@@ -94,16 +94,16 @@ def test_wrong_arguments_are_named():
     camera = Camera.framing(ball().vertices)
     with pytest.raises(ValueError, match="size: wanted positive numbers"):
         render(ball(), camera, 0)
-    with pytest.raises(ValueError, match="points: wanted finite points"):
+    with pytest.raises(ValueError, match="points: wanted at least one finite point"):
         Camera.framing(np.zeros((0, 3)))
-    with pytest.raises(ValueError, match="same point"):
+    with pytest.raises(ValueError, match="camera: wanted different points as position and target"):
         render(ball(), Camera((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 32)
 
 
 def test_what_was_prepared_draws_the_same_picture():
     mesh, other = ball(), ball(center=(0.3, 0.6, 0.1))
     camera = Camera.framing(mesh.vertices, margin=0.2)
-    backdrop = Backdrop(camera, (64, 48), Ground(-0.1), Look())
+    backdrop = Backdrop(camera, (64, 48), Floor(-0.1), Look())
     for shown in (mesh, other, None):
         wanted = render(shown, camera, (64, 48), floor_y=-0.1)
         np.testing.assert_array_equal(render(shown, camera, (64, 48), backdrop=backdrop), wanted)
@@ -118,7 +118,7 @@ def test_what_was_prepared_draws_the_same_picture():
 def test_lines_on_the_floor_are_faint_and_stay_where_they_are():
     camera = Camera.framing(ball().vertices, elevation_rad=math.radians(60), margin=0.3)
     plain, lined = (
-        render(None, camera, 160, backdrop=Backdrop(camera, (160, 160), Ground(0.0, spacing), Look())).astype(int)
+        render(None, camera, 160, backdrop=Backdrop(camera, (160, 160), Floor(0.0, spacing), Look())).astype(int)
         for spacing in (None, 0.25)
     )
     darker = (plain - lined).mean(axis=2)

@@ -31,8 +31,8 @@ def test_a_still_camera_sees_the_whole_motion_from_every_side_at_one_scale():
     points, poses = walk()
     stage = set_stage(points, poses, parse_views(["front", "left", "back", "top", "-45"], 20, 9))
     assert stage.is_still
-    assert stage.ground.spacing is None
-    assert stage.ground.height == pytest.approx(points[..., 1].min())
+    assert stage.floor.spacing is None
+    assert stage.floor.height == pytest.approx(points[..., 1].min())
     distances = []
     for view in range(5):
         assert stage.camera(view, 0) == stage.camera(view, FRAMES - 1)
@@ -52,7 +52,7 @@ def test_a_camera_that_follows_keeps_the_body_in_the_middle_and_does_not_sway():
     points, poses = walk()
     stage = set_stage(points, poses, parse_views(["left"]), camera="follow")
     still = set_stage(points, poses, parse_views(["left"]))
-    assert stage.ground.spacing == pytest.approx(0.5)  # lines show that it walks
+    assert stage.floor.spacing == pytest.approx(0.5)  # lines show that it walks
     for frame in (0, 30, FRAMES - 1):
         seen = places(stage, 0, frame, points[frame])
         assert seen.min() > 0.05
@@ -76,7 +76,7 @@ def test_a_turntable_goes_round_with_everything_in_the_picture():
         assert seen.min() > 0.04
         assert seen.max() < 0.96
     assert not stage.is_still
-    assert stage.ground.spacing
+    assert stage.floor.spacing
 
 
 def test_what_stands_beside_fits_too_at_the_same_scale():
@@ -99,17 +99,17 @@ def test_what_must_be_seen_too_is_seen_but_not_followed():
     also[40, :, 1] -= 0.5
     alone, both = (set_stage(points, poses, parse_views(["left"]), camera="follow", also=more) for more in (None, also))
     np.testing.assert_array_equal(both.shifts, alone.shifts)
-    assert both.ground.height < alone.ground.height
+    assert both.floor.height < alone.floor.height
     assert places(alone, 0, 20, also[20]).min() < 0.05 <= places(both, 0, 20, also[20]).min()
 
 
-def test_views_and_turntables_that_nobody_can_show_are_refused():
+def test_views_and_turntables_that_cannot_be_shown_are_rejected():
     assert [view.label for view in parse_views(["top", "45", "-30.5"])] == ["top", "45°", "-30.5°"]
     for names, message in (
-        (["frnt"], "views must be front, left, back, right, top or degrees .* got 'frnt'; did you mean 'front'"),
-        ([], "views must be 1 to 8"),
-        (["front"] * 9, "views must be 1 to 8"),
-        (["left", "left"], "views has 'left' twice"),
+        (["frnt"], "views: wanted front, left, back, right, top or degrees .* got 'frnt'; did you mean 'front'"),
+        ([], "views: wanted 1 to 8"),
+        (["front"] * 9, "views: wanted 1 to 8"),
+        (["left", "left"], "views: wanted each view once, got 'left' twice"),
         (["400"], "degrees from -360 to 360, got '400'"),
         (["nan"], "got 'nan'"),
     ):
@@ -119,7 +119,7 @@ def test_views_and_turntables_that_nobody_can_show_are_refused():
     assert parse_turntable("true") == pytest.approx(math.pi / 4)
     assert parse_turntable("-90") == pytest.approx(-math.pi / 2)
     for text in ("fast", "nan", "1000", ""):
-        with pytest.raises(UserError, match="turntable must be true, false or degrees a second"):
+        with pytest.raises(UserError, match="turntable: wanted true, false or at most 720 degrees per second"):
             parse_turntable(text)
 
 
@@ -135,5 +135,5 @@ def test_panels_stand_side_by_side_with_labels_and_say_how_large_they_are():
     assert Screen(stage, (40, 50), {"a": "a", "b": "b"}).columns == 3
     single = Screen(set_stage(points, poses, parse_views(["front"])), (40, 50), {"avatar": "avatar"})
     assert single.draw(0, {"avatar": None}).shape == (50, 40, 3)
-    with pytest.raises(UserError, match=r"12 panels of 1024 x 2048 pixels .* give a smaller video_size, which is that of one"):
+    with pytest.raises(UserError, match=r"video_size: wanted .* 12 panels of 1024 x 2048; give a smaller video_size"):
         picture_size((1024, 2048), 3, 4)

@@ -10,8 +10,9 @@ from typing import Any
 
 from snarfcli.files import write_json
 from snarfcli.reproduce.experiments import EXPERIMENTS
-from snarfcli.reproduce.jobs import STATUS, Status
-from snarfcli.reproduce.plans import Choice, Job, Plan, make_plan
+from snarfcli.reproduce.jobs import STATUS, JobStatus
+from snarfcli.reproduce.planning import make_plan
+from snarfcli.reproduce.plans import ExperimentOptions, Job, Plan
 
 
 def fake_settings(overrides: Sequence[str]) -> dict[str, Any]:
@@ -29,7 +30,7 @@ def fake_plan(root: Path, what: str = "table1", **choice: Any) -> Plan:
     choice = {"subjects": ("50002",), "data_root": str(root / "data"), "output_root": str(root / "outputs")} | choice
     for subject in choice["subjects"]:
         fake_samples(root / "data", subject)
-    return make_plan(EXPERIMENTS[what], Choice(**choice), fake_settings)
+    return make_plan(EXPERIMENTS[what], ExperimentOptions(**choice), fake_settings)
 
 
 def fake_run(job: Job, values: Mapping[str, float], state: str = "done", reason: str = "", *, trained: bool = True) -> None:
@@ -45,7 +46,7 @@ def fake_run(job: Job, values: Mapping[str, float], state: str = "done", reason:
         if evaluation.split in values:
             write_json(Path(evaluation.metrics), fake_metrics(values[evaluation.split], evaluation.settings))
     stage = "" if state == "done" else "train"
-    write_json(folder / STATUS, asdict(Status(state, job.digest, trained, stage, reason)))
+    write_json(folder / STATUS, asdict(JobStatus(state, job.digest, trained, stage, reason)))
 
 
 def fake_metrics(surface: float, settings: Mapping[str, Any]) -> dict[str, Any]:

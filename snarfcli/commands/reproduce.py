@@ -17,9 +17,10 @@ from snarfcli.errors import UserError
 from snarfcli.hydra_config.overrides import check_overrides
 from snarfcli.hydra_config.schema import config_folder, preset_groups, register_schemas
 from snarfcli.parallel import count_cores
-from snarfcli.reproduce.jobs import Status, read_status
+from snarfcli.reproduce.jobs import JobStatus, read_status
 from snarfcli.reproduce.launching import LAUNCHERS, Launcher, check_launcher, launch
-from snarfcli.reproduce.plans import Choice, Job, Plan, choose_experiments, make_plan, unique_jobs
+from snarfcli.reproduce.planning import choose_experiments, make_plan
+from snarfcli.reproduce.plans import ExperimentOptions, Job, Plan, unique_jobs
 from snarfcli.reproduce.report import write_report
 from snarfcli.reproduce.results import Result, collect
 from snarfcli.reproduce.tables import plain_table
@@ -89,7 +90,7 @@ def run(config: ReproduceConfig) -> int:
         OSError: a folder cannot be written to, or the disk is full.
     """
     launcher = _check(config)
-    choice = Choice(
+    choice = ExperimentOptions(
         subjects=tuple(config.subjects), seeds=tuple(config.seeds), training=config.training, data=config.data,
         systems=tuple(config.systems), extra=tuple(config.extra), data_root=config.data_root,
         output_root=config.output_root, threads=launcher.threads, device=config.device, max_frames=config.max_frames,
@@ -225,7 +226,7 @@ class _Progress:
         self._ended: set[int] = set()
         self._worked_s: list[float] = []
 
-    def __call__(self, number: int, status: Status) -> None:
+    def __call__(self, number: int, status: JobStatus) -> None:
         job = self.jobs[number]
         if status.state == "running":
             log.info("started: %s (%s)", job.name, Path(job.folder) / "reproduce.log")
@@ -239,7 +240,7 @@ class _Progress:
             self._worked_s.append(seconds)
         log.info("%d of %d: %s: %s%s", len(self._ended), len(self.jobs), job.name, self._outcome(job, status), self._left())
 
-    def _outcome(self, job: Job, status: Status) -> str:
+    def _outcome(self, job: Job, status: JobStatus) -> str:
         if status.state != "done":
             return f"{status.state} ({status.stage}: {status.reason})" if status.reason else status.state
         values = collect(job).values

@@ -1,1 +1,1 @@
-"""The papers' tables and figures in one command: what to run, how it is run, and what is written about it."""
+"""The papers' tables and figures: experiments, their plans, the jobs that run them, and the reports."""

@@ -1,4 +1,4 @@
-"""One run of a plan: samples, training and evaluation, each a command of its own, with what became of it written down."""
+"""One run of a plan: runs its commands for samples, training and evaluation, and records the status of each stage."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from typing import Any
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.locks import locked
-from snarfcli.reproduce.plans import Evaluation, Job
+from snarfcli.reproduce.plans import EvaluationStage, Job
 from snarfcli.samples.store import samples_folder
 
-__all__ = ["LOG", "STATUS", "JobStopped", "Status", "is_evaluated", "read_status", "run_command", "run_job"]
+__all__ = ["LOG", "STATUS", "JobStatus", "JobStopped", "is_evaluated", "read_status", "run_command", "run_job"]
 
 STATUS = "reproduce.json"
-"""Name of the file in the run's folder that says what became of it."""
+"""Name of the status file in the run folder."""
 LOG = "reproduce.log"
-"""Name of the file in the run's folder with what its commands said."""
+"""Name of the file in the run folder with the output of its commands."""
 
 _LOCK = ".reproduce.lock"
 _LOOK_EVERY_S = 0.3
-# What a step of training, a frame of an evaluation and a checkpoint may take before a command is ended the hard way.
+# Time between Ctrl-C and SIGKILL: a training step or a frame of an evaluation, and a checkpoint.
 _PATIENCE_S = 90.0
 
 
@@ -36,36 +36,36 @@ class JobStopped(Exception):
 
 
 @dataclass(frozen=True)
-class Status:
-    """What became of a run so far."""
+class JobStatus:
+    """Status of a run."""
 
     state: str
     """running, done, failed, diverged or stopped."""
     digest: str = ""
-    """Of the settings that it was trained with."""
+    """Hash of the settings that it was trained with."""
     trained: bool = False
-    """Whether the avatar is there."""
+    """Whether the avatar exists."""
     stage: str = ""
-    """samples, train, id or ood: what it is at, or where it failed."""
+    """samples, train, id or ood: the stage that is running or has failed."""
     reason: str = ""
-    """Why it failed, one line."""
+    """Reason of a failure, one line."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Time that the stages of the last call took; those that had nothing to do are left out."""
+    """Duration of each stage of the last call; stages with nothing to do are left out."""
 
 
 Runner = Callable[[Sequence[str], Path, Callable[[], bool]], int]
-"""Runs `snarf` with arguments, appends what it says to a file, asks now and then whether to stop; returns its exit code."""
+"""Runs `snarf` with arguments, appends its output to a file, regularly asks whether to stop, and returns its exit code."""
 
 
-def run_job(job: Job, *, stopped: Callable[[], bool] = lambda: False, runner: Runner | None = None) -> Status:
-    """Do what is missing of a run, and return and write down what became of it.
+def run_job(job: Job, *, stopped: Callable[[], bool] = lambda: False, runner: Runner | None = None) -> JobStatus:
+    """Run the missing stages of a run, and return and record its status.
 
-    What is there already is kept: samples, an avatar trained with the same settings, evaluations that are newer than it. A run
-    that diverged stays so, since the same seed would lead there again.
+    Existing samples, an avatar trained with the same settings, and evaluations newer than the avatar are kept. A run that
+    diverged is not repeated: with the same seed it would diverge again.
 
     Args:
         job: the run.
-        stopped: asked now and then; once it is true the running command gets the chance to write a checkpoint.
+        stopped: called regularly; when it returns True, the running command is interrupted and can write a checkpoint.
         runner: runs the commands.
     """
     folder = Path(job.folder)
@@ -81,24 +81,24 @@ def run_job(job: Job, *, stopped: Callable[[], bool] = lambda: False, runner: Ru
             try:
                 status = _Stages(job, stopped, runner).run()
             except (JobStopped, KeyboardInterrupt):
-                status = replace(read_status(folder) or Status("stopped", job.digest), state="stopped")
+                status = replace(read_status(folder) or JobStatus("stopped", job.digest), state="stopped")
             write_json(folder / STATUS, asdict(status))
-    except (JobStopped, KeyboardInterrupt):  # before it began, so that what is written there stays true
-        status = Status("stopped", job.digest)
+    except (JobStopped, KeyboardInterrupt):  # before any stage, so the recorded status is still true
+        status = JobStatus("stopped", job.digest)
     return status
 
 
-def read_status(folder: Path) -> Status | None:
-    """Return what became of the run in a folder, or None if nothing is known."""
+def read_status(folder: Path) -> JobStatus | None:
+    """Return the recorded status of the run in a folder, or None without one."""
     try:
         content = read_json(folder / STATUS)
-        return Status(**content)
+        return JobStatus(**content)
     except (UserError, TypeError):
         return None
 
 
-def is_evaluated(evaluation: Evaluation, avatar: Path) -> bool:
-    """Return whether an evaluation is there, newer than the avatar and made with the wanted settings."""
+def is_evaluated(evaluation: EvaluationStage, avatar: Path) -> bool:
+    """Return whether an evaluation exists, is newer than the avatar and has the wanted settings."""
     path = Path(evaluation.metrics)
     if not path.is_file() or not avatar.is_file() or path.stat().st_mtime < avatar.stat().st_mtime:
         return False
@@ -110,24 +110,25 @@ def is_evaluated(evaluation: Evaluation, avatar: Path) -> bool:
 
 
 class _Stages:
-    """The stages of one run, one after the other."""
+    """The stages of one run, in order."""
 
     def __init__(self, job: Job, stopped: Callable[[], bool], runner: Runner) -> None:
         self.job, self.stopped, self.runner = job, stopped, runner
         self.folder = Path(job.folder)
         self.avatar = self.folder / "avatar.pt"
-        self.before = read_status(self.folder) or Status("stopped")
+        self.before = read_status(self.folder) or JobStatus("stopped")
         same = self.before.digest == job.digest
-        self.status = Status("running", job.digest, trained=same and self.before.trained and self.avatar.is_file())
+        self.status = JobStatus("running", job.digest, trained=same and self.before.trained and self.avatar.is_file())
 
-    def run(self) -> Status:
+    def run(self) -> JobStatus:
+        """Run the stages and return the final status."""
         if self.before.state == "diverged" and self.before.digest == self.job.digest and self._has_diverged():
             return replace(self.before, seconds={})
         for samples in self.job.samples:
-            if not _are_there(samples.folder):
+            if not _samples_exist(samples.folder):
                 place = Path(samples.folder)
                 with locked(place.with_name(f".{place.name}.lock"), self._check):
-                    if not _are_there(samples.folder) and not self._stage("samples", samples.arguments):
+                    if not _samples_exist(samples.folder) and not self._stage("samples", samples.arguments):
                         return self.status
         if not self.status.trained:
             if not self._stage("train", self.job.train):
@@ -135,7 +136,7 @@ class _Stages:
             self._write(trained=True)
         for evaluation in self.job.evaluations:
             if not is_evaluated(evaluation, self.avatar) and self._can_be_evaluated(evaluation):
-                # an older evaluation must not pass for this one's
+                # so that an older evaluation is not taken for this one
                 Path(evaluation.metrics).unlink(missing_ok=True)
                 if not self._stage(evaluation.split, evaluation.arguments):
                     return self.status
@@ -146,7 +147,7 @@ class _Stages:
             raise JobStopped
 
     def _stage(self, name: str, arguments: Sequence[str]) -> bool:
-        """Run one command; return whether it went well, else `status` says why not."""
+        """Run one command and return whether it succeeded; otherwise `status` has the reason."""
         self._check()
         self._write(stage=name)
         start, log = time.monotonic(), self.folder / LOG
@@ -167,8 +168,8 @@ class _Stages:
         except (UserError, AttributeError):
             return False
 
-    def _can_be_evaluated(self, evaluation: Evaluation) -> bool:
-        """Return whether the samples have frames of this split; data without them is no failure of the run."""
+    def _can_be_evaluated(self, evaluation: EvaluationStage) -> bool:
+        """Return whether the samples have frames of this split; a data set without them is no failure of the run."""
         folder = samples_folder(evaluation.data_root, evaluation.data, self.job.subject)
         return _frames(folder, "test" if evaluation.split == "id" else "ood") != 0
 
@@ -178,10 +179,10 @@ class _Stages:
 
 
 def run_command(arguments: Sequence[str], log: Path, stopped: Callable[[], bool]) -> int:
-    """Run `snarf` in a process of its own and return its exit code; see `Runner`.
+    """Run `snarf` in a new process and return its exit code; see `Runner`.
 
     Raises:
-        JobStopped: it was to stop and has ended.
+        JobStopped: it was interrupted because `stopped` returned True.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a") as file:
@@ -197,7 +198,7 @@ def run_command(arguments: Sequence[str], log: Path, stopped: Callable[[], bool]
                 break
             except subprocess.TimeoutExpired:
                 if asked_s is None and stopped():
-                    # Ctrl-C, by which a training writes its checkpoint
+                    # as Ctrl-C, after which a training writes its checkpoint
                     process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
                     asked_s = time.monotonic()
                 elif asked_s is not None and time.monotonic() - asked_s > _PATIENCE_S:
@@ -211,12 +212,12 @@ def run_command(arguments: Sequence[str], log: Path, stopped: Callable[[], bool]
     return code
 
 
-def _are_there(folder: str) -> bool:
+def _samples_exist(folder: str) -> bool:
     return (Path(folder) / "manifest.json").is_file()  # written last
 
 
 def _frames(folder: Path, split: str) -> int | None:
-    """Return how many frames of a split the samples have; None if nobody knows."""
+    """Return the number of frames of a split in the samples; None if it is unknown."""
     try:
         return int(read_json(folder / "manifest.json")["frames"][split])
     except (UserError, KeyError, TypeError, ValueError):
@@ -224,7 +225,7 @@ def _frames(folder: Path, split: str) -> int | None:
 
 
 def _reason(log: Path, begin: int, code: int) -> str:
-    """Return why a command failed: its last line, which is its message, without its name."""
+    """Return why a command failed: the last line of its output, without the name of the command."""
     with log.open("rb") as file:
         file.seek(begin)
         lines = [line.strip() for line in file.read().decode(errors="replace").splitlines() if line.strip()]

@@ -1,9 +1,9 @@
-"""Running the jobs of a plan side by side, through Hydra's launchers, and watching what becomes of them.
+"""Run the jobs of a plan in parallel with Hydra's launchers, and watch their status.
 
-DESIGN. The plan is a file. `snarf reproduce_job -m job=0,1,2 hydra/launcher=...` in a process of its own hands its jobs to the
-launcher; every job writes what becomes of it beside the plan, on a disk that all see, and looks there whether it should stop.
-So a job may run in this process's child, in a worker of joblib or on another machine of a cluster, and Ctrl-C reaches them all:
-each lets its command write a checkpoint and ends.
+DESIGN. The plan is a file on a disk that all machines see. A child process, `snarf reproduce_job -m job=0,1,2
+hydra/launcher=...`, gives its jobs to the launcher. Every job writes its status beside the plan, and looks there for a file
+that asks it to stop. So a job can run in the child process, in a worker of joblib or on another machine of a cluster, and
+Ctrl-C reaches all of them: each lets its command write a checkpoint and ends.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, one_line
 from snarfcli.files import read_json, write_json
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.locks import one_of
-from snarfcli.reproduce.jobs import Status, run_job
+from snarfcli.reproduce.jobs import JobStatus, run_job
 from snarfcli.reproduce.plans import Job
 
 __all__ = ["LAUNCHERS", "Launcher", "check_launcher", "is_installed", "launch", "run_planned_job"]
@@ -36,11 +36,11 @@ __all__ = ["LAUNCHERS", "Launcher", "check_launcher", "is_installed", "launch", 
 log = logging.getLogger(__name__)
 
 LAUNCHERS = ("basic", "joblib", "submitit_local", "submitit_slurm")
-"""What can distribute jobs: one after the other, processes of this machine, submitit's on this machine or a cluster."""
+"""How jobs can be distributed: one after the other, on processes (joblib), by submitit on this machine or on a cluster."""
 
 _PACKAGES = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit"}
 _LOOK_EVERY_S = 0.5
-_LONGEST_MIN = 7 * 24 * 60  # submitit's own limit is an hour
+_TIME_LIMIT_MIN = 7 * 24 * 60  # the default of submitit is an hour
 
 
 @dataclass(frozen=True)
@@ -50,18 +50,18 @@ class Launcher:
     name: str = "basic"
     """One of `LAUNCHERS`."""
     processes: int = 1
-    """Jobs at a time; on a cluster at most."""
+    """Number of jobs at a time; on a cluster the maximum."""
     threads: int | None = None
-    """Threads of each, which a cluster is asked for."""
+    """Threads per job, requested from a cluster."""
     settings: tuple[str, ...] = ()
     """Further settings of Hydra's launcher, such as partition=gpu."""
 
 
 def check_launcher(launcher: Launcher) -> None:
-    """Refuse a launcher that is not installed, before any work.
+    """Check that a launcher is installed and can run the wanted number of processes.
 
     Raises:
-        UserError: it is not, or more than one process is wanted from one that has one.
+        UserError: it is not installed, or it runs one job at a time and more are wanted.
     """
     package = _PACKAGES.get(launcher.name)
     if package and not is_installed(package):
@@ -70,33 +70,33 @@ def check_launcher(launcher: Launcher) -> None:
             f"(or pip install hydra-{package}-launcher)"
         )
     if launcher.name == "basic" and launcher.processes > 1:
-        raise UserError(f"launcher=basic runs one job at a time, got processes={launcher.processes}; give launcher=joblib too")
+        raise UserError(f"processes: wanted 1 with launcher=basic, got {launcher.processes}; give launcher=joblib too")
 
 
 def is_installed(package: str) -> bool:
     """Return whether Hydra's launcher joblib or submitit is installed."""
     try:
         return importlib.util.find_spec(f"hydra_plugins.hydra_{package}_launcher") is not None
-    except ModuleNotFoundError:  # no plugin of Hydra is
+    except ModuleNotFoundError:  # no Hydra plugin is installed
         return False
 
 
 def launch(
-    jobs: Sequence[Job], folder: Path, launcher: Launcher, on_change: Callable[[int, Status], None]
-) -> list[Status | None]:
-    """Run jobs and return what became of each; None for one that the launcher never came to.
+    jobs: Sequence[Job], folder: Path, launcher: Launcher, on_change: Callable[[int, JobStatus], None]
+) -> list[JobStatus | None]:
+    """Run jobs and return the status of each; None for a job that the launcher has not started.
 
-    Ctrl-C (or a signal to end) lets every running command write its checkpoint; a second one ends all at once.
+    On Ctrl-C (or SIGTERM, SIGHUP) every running command writes its checkpoint; a second Ctrl-C kills all processes.
 
     Args:
-        jobs: what to run.
-        folder: for the plan, and for what the launcher writes.
-        launcher: how.
+        jobs: the jobs.
+        folder: for the plan and the files of the launcher.
+        launcher: how the jobs are distributed.
         on_change: called with the number of a job and its status when it starts and when it ends.
 
     Raises:
-        UserError: the launcher could not start at all.
-        KeyboardInterrupt: interrupted; everything has ended.
+        UserError: the launcher has not started any job.
+        KeyboardInterrupt: interrupted; all processes have ended.
     """
     work = folder / secrets.token_hex(4)
     work.mkdir(parents=True)
@@ -107,7 +107,7 @@ def launch(
             [sys.executable, "-m", "snarfcli", *_arguments(work, len(jobs), launcher)],
             stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
-    seen: dict[int, Status] = {}
+    seen: dict[int, JobStatus] = {}
 
     def look() -> None:
         for number in range(len(jobs)):
@@ -130,7 +130,7 @@ def launch(
     left = [number for number in range(len(jobs)) if number not in seen or seen[number].state == "running"]
     if left:
         lines = [line.strip() for line in said.read_text(errors="replace").splitlines() if line.strip()]
-        why = f"{lines[-1] if lines else 'it said nothing'}; see {said}"
+        why = f"{lines[-1] if lines else 'no output'}; see {said}"
         if not seen:
             raise UserError(f"launcher={launcher.name} started no job: {why}")
         log.warning("warning: launcher=%s ended before %d of %d jobs did: %s", launcher.name, len(left), len(jobs), why)
@@ -138,22 +138,22 @@ def launch(
 
 
 def run_planned_job(plan: Path, number: int) -> None:
-    """Run one job of the plan in a file and write beside it what became of it.
+    """Run one job of the plan in a file, and write its status beside the file.
 
     Raises:
-        UserError: there is no such plan or job.
+        UserError: the plan or the job does not exist.
     """
     content = read_json(plan, "plan")
     try:
         job = Job.from_dict(content["jobs"][number])
         slots = content["slots"]
     except (KeyError, IndexError, TypeError):
-        raise UserError(f"plan {plan} has no job {number}; it is written by snarf reproduce") from None
+        raise UserError(f"plan {plan} has no job {number}; use a plan that snarf reproduce has written") from None
     result, stop = plan.with_name(f"{number}.json"), plan.with_name("stop")
 
-    def begin() -> Status:
+    def begin() -> JobStatus:
         if not stop.exists():
-            write_json(result, asdict(Status("running", job.digest)))
+            write_json(result, asdict(JobStatus("running", job.digest)))
         return run_job(job, stopped=stop.exists)
 
     try:
@@ -162,13 +162,13 @@ def run_planned_job(plan: Path, number: int) -> None:
         else:
             with one_of([plan.with_name(f"slot{slot}") for slot in range(slots)]):
                 status = begin()
-    except Exception as error:  # a fault of the program or a full disk: one job's, not of those after it
-        status = Status("failed", job.digest, stage="reproduce", reason=" ".join(f"{type(error).__name__}: {error}".split()))
+    except Exception as error:  # a fault of the program or a full disk; the other jobs still run
+        status = JobStatus("failed", job.digest, stage="reproduce", reason=f"{type(error).__name__}: {one_line(error)}")
     write_json(result, asdict(status))
 
 
 def _arguments(work: Path, count: int, launcher: Launcher) -> list[str]:
-    """Return the arguments of `snarf` that hand the jobs to Hydra's launcher."""
+    """Return the arguments of `snarf` that give the jobs to Hydra's launcher."""
     arguments = ["reproduce_job", f"plan={quote(str(work / 'plan.json'))}", f"job={','.join(map(str, range(count)))}"]
     arguments += ["-m"] if count > 1 or launcher.name != "basic" else []
     settings = {"hydra.sweep.dir": quote(str(work / "launcher"))}
@@ -177,7 +177,7 @@ def _arguments(work: Path, count: int, launcher: Launcher) -> list[str]:
     if launcher.name == "joblib":
         settings |= {"hydra.launcher.n_jobs": str(launcher.processes)}
     if launcher.name.startswith("submitit"):
-        settings |= {"hydra.launcher.timeout_min": str(_LONGEST_MIN)}
+        settings |= {"hydra.launcher.timeout_min": str(_TIME_LIMIT_MIN)}
         if launcher.threads:
             settings["hydra.launcher.cpus_per_task"] = str(launcher.threads)
     if launcher.name == "submitit_slurm":
@@ -187,19 +187,19 @@ def _arguments(work: Path, count: int, launcher: Launcher) -> list[str]:
 
 
 def _slots(launcher: Launcher) -> int | None:
-    """Return how many jobs may work at once where the launcher itself starts all of them."""
+    """Return the maximum number of jobs at a time for a launcher that starts all of them, None for the others."""
     return launcher.processes if launcher.name == "submitit_local" else None
 
 
-def _read(path: Path) -> Status | None:
+def _read(path: Path) -> JobStatus | None:
     try:
-        return Status(**json.loads(path.read_text()))
+        return JobStatus(**json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):
         return None
 
 
 def _stop(process: subprocess.Popen[Any], work: Path) -> None:
-    """Ask all jobs to end and wait for it; on a second Ctrl-C end them."""
+    """Ask all jobs to end and wait for them; on a second Ctrl-C kill them."""
     (work / "stop").touch()
     try:
         process.wait()
@@ -213,7 +213,7 @@ def _stop(process: subprocess.Popen[Any], work: Path) -> None:
 
 @contextmanager
 def _signals_as_interrupt() -> Iterator[None]:
-    """Take requests to end for Ctrl-C, unless whoever started us has them ignored, as nohup does."""
+    """Handle SIGTERM and SIGHUP like Ctrl-C, unless they are ignored in this process, as with nohup."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

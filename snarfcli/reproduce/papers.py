@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 
@@ -12,12 +12,12 @@ __all__ = ["paper_numbers", "paper_source"]
 
 
 def paper_numbers(table: str, system: str | None, subject: str | None = None) -> dict[str, float]:
-    """Return what a paper's table says of a system, by the names of our columns; nothing where it says nothing.
+    """Return the numbers of a system in a paper's table, by our column names; empty if the paper has none.
 
     Args:
         table: table1 or table2; any other name has no numbers.
         system: name of the row in `papers.yaml`.
-        subject: one subject of DFaust, or None for the mean over all ten.
+        subject: a subject of DFaust, or None for the mean over all ten.
 
     Returns:
         IoU in percent, times for 200,000 points in milliseconds, training in minutes.
@@ -30,10 +30,11 @@ def paper_numbers(table: str, system: str | None, subject: str | None = None) ->
 
 
 def paper_source(table: str) -> str | None:
-    """Return where the numbers of a table come from."""
+    """Return the source of the numbers of a table."""
     return _content().get(table, {}).get("source")
 
 
 @cache
 def _content() -> dict[str, Any]:
-    return OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("papers.yaml")))  # type: ignore[return-value]
+    content = OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("papers.yaml")))
+    return cast(dict[str, Any], content)

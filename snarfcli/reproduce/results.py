@@ -11,7 +11,7 @@ from typing import Any
 
 from snarfcli.errors import UserError
 from snarfcli.files import read_json
-from snarfcli.reproduce.jobs import Status, is_evaluated, read_status
+from snarfcli.reproduce.jobs import JobStatus, is_evaluated, read_status
 from snarfcli.reproduce.plans import Job
 
 __all__ = ["COLUMNS", "MORE_COLUMNS", "Cell", "Column", "Result", "collect", "summarise"]
@@ -175,7 +175,7 @@ def summarise(results: Sequence[Result], column: Column) -> Cell:
     return Cell(mean, deviation, len(results), count, unknown)
 
 
-def _state(status: Status, job: Job, files: dict[str, Path]) -> tuple[str, str]:
+def _state(status: JobStatus, job: Job, files: dict[str, Path]) -> tuple[str, str]:
     if status.state in ("failed", "diverged"):
         return status.state, f"{status.stage}: {status.reason}"
     if status.state == "done" and "train" not in files:

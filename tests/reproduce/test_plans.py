@@ -12,7 +12,8 @@ from snarfcli.errors import UserError
 from snarfcli.hydra_config.overrides import check_overrides
 from snarfcli.reproduce.experiments import EXPERIMENTS
 from snarfcli.reproduce.papers import paper_numbers
-from snarfcli.reproduce.plans import Choice, Job, choose_experiments, make_plan, unique_jobs
+from snarfcli.reproduce.planning import choose_experiments, make_plan
+from snarfcli.reproduce.plans import ExperimentOptions, Job, unique_jobs
 
 
 def overrides_of(arguments):
@@ -27,7 +28,7 @@ def test_every_row_of_every_experiment_has_settings_of_the_commands(name, tmp_pa
     subjects = experiment.subjects[experiment.data[0]]
     for subject in subjects:
         fake_samples(tmp_path, subject, experiment.data[0])
-    plan = make_plan(experiment, Choice(data_root=str(tmp_path), seeds=(0, 1)), resolve_training)
+    plan = make_plan(experiment, ExperimentOptions(data_root=str(tmp_path), seeds=(0, 1)), resolve_training)
     assert len(plan.jobs) == 2 * len(subjects) * len(experiment.rows)
     for job in plan.jobs:
         check_overrides(overrides_of(job.train), TrainConfig, "train")
@@ -106,7 +107,7 @@ def test_jobs_survive_being_written_down(tmp_path):
 
 
 def test_all_runs_what_experiments_share_once(tmp_path):
-    chosen = choose_experiments("all", Choice(data="dfaust", subjects=("50002",), training="paper"))
+    chosen = choose_experiments("all", ExperimentOptions(data="dfaust", subjects=("50002",), training="paper"))
     assert [(one.name, part.data, part.subjects, part.training) for one, part in chosen] == [
         ("table1", "dfaust", ("50002",), "paper"), ("table2", "dfaust", ("50002",), "paper"),
         ("ablations", "dfaust", ("50002",), "paper"), ("stick2d", None, (), None), ("clothed", "cape", (), "paper"),
@@ -120,7 +121,7 @@ def test_all_runs_what_experiments_share_once(tmp_path):
 WRONG = [
     ({"systems": ("nsa",)}, "there is no row 'nsa'; did you mean 'nasa'?"),
     ({"training": "quik"}, "there is no training=quik; did you mean 'quick'?"),
-    ({"data": "cape"}, "table1 is made on data=builtin or dfaust, got 'cape'"),
+    ({"data": "cape"}, "data: wanted builtin or dfaust for table1, got 'cape'"),
     ({"seeds": (1, 1)}, "seeds: wanted different"),
     ({"seeds": ()}, "seeds: wanted different whole numbers from 0, at least one"),
     ({"extra": ("seed=3",)}, "extra: seed is set by reproduce itself; give seeds="),
@@ -136,13 +137,13 @@ def test_a_choice_that_cannot_be_made_is_refused(choice, message, tmp_path):
 
 def test_subjects_must_be_there_before_anything_runs(tmp_path):
     with pytest.raises(UserError, match="no subject '50003'; did you mean"):
-        make_plan(EXPERIMENTS["table1"], Choice(subjects=("50003",), data_root=str(tmp_path)), resolve_training)
+        make_plan(EXPERIMENTS["table1"], ExperimentOptions(subjects=("50003",), data_root=str(tmp_path)), resolve_training)
     with pytest.raises(UserError, match=r"(?i)dfaust"):
-        make_plan(EXPERIMENTS["table1"], Choice(data="dfaust", data_root=str(tmp_path)), resolve_training)
+        make_plan(EXPERIMENTS["table1"], ExperimentOptions(data="dfaust", data_root=str(tmp_path)), resolve_training)
 
 
 def test_experiments_are_known_by_name():
-    with pytest.raises(UserError, match=r"one of table1, .*, all, got 'tabel1'; did you mean 'table1'"):
-        choose_experiments("tabel1", Choice())
+    with pytest.raises(UserError, match=r"what: wanted table1, .* or all, got 'tabel1'; did you mean 'table1'"):
+        choose_experiments("tabel1", ExperimentOptions())
     with pytest.raises(UserError, match=r"row pose_onet: unknown setting 'training.stps'"):
-        make_plan(EXPERIMENTS["table1"], Choice(extra=("training.stps=3",)), resolve_training)
+        make_plan(EXPERIMENTS["table1"], ExperimentOptions(extra=("training.stps=3",)), resolve_training)

@@ -33,15 +33,15 @@ def call(capsys, *arguments):
 
 
 WRONG = {
-    ("tabel1",): "one of table1, table2, ablations, stick2d, clothed, all, got 'tabel1'; did you mean 'table1'?",
-    (): "wanted what to reproduce",
+    ("tabel1",): "what: wanted table1, table2, ablations, stick2d, clothed or all, got 'tabel1'; did you mean 'table1'?",
+    (): "what: wanted table1, table2, ablations, stick2d, clothed or all, got none",
     ("table1", "systems=[nsa]"): "there is no row 'nsa'; did you mean 'nasa'?",
     ("table1", "training=quik"): "there is no training=quik; did you mean 'quick'?",
-    ("table1", "data=cap"): "table1 is made on data=builtin or dfaust, got 'cap'",
+    ("table1", "data=cap"): "data: wanted builtin or dfaust for table1, got 'cap'",
     ("table1", "subjects=[50003]"): "no subject '50003'; did you mean '500",
     ("table1", "extra=[training.stps=1]"): "row pose_onet: unknown setting 'training.stps'; did you mean 'training.steps'?",
     ("table1", "launcher=slurm"): "launcher: wanted basic, joblib",
-    ("table1", "processes=2"): "launcher=basic runs one job at a time, got processes=2",
+    ("table1", "processes=2"): "processes: wanted 1 with launcher=basic, got 2",
     ("table1", "launcher_settings=[gpu]"): "launcher_settings: wanted settings such as [partition=gpu], got 'gpu'",
     ("table1", "table2"): "wanted a setting NAME=VALUE, got 'table2'",
     ("table1", "sistems=[nasa]"): "unknown setting 'sistems'; did you mean 'systems'?",

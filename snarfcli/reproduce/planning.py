@@ -1,0 +1,227 @@
+"""From the options of `snarf reproduce` to the plan of each experiment."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from snarfcli.checks import alternatives, check_choice
+from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request, find_source
+from snarfcli.errors import UserError, nearest
+from snarfcli.hydra_config.overrides import quote
+from snarfcli.hydra_config.schema import group_options
+from snarfcli.reproduce.experiments import EXPERIMENTS, Experiment, Row
+from snarfcli.reproduce.plans import EvaluationStage, ExperimentOptions, Job, Plan, SamplesStage
+from snarfcli.runs import run_folder
+from snarfcli.samples.store import samples_folder
+
+__all__ = ["choose_experiments", "make_plan"]
+
+# The out-of-distribution poses of DFaust's subjects are another data set: PosePrior's motion on their bodies.
+_OTHER_OOD_DATA = {"dfaust": "poseprior"}
+_PARITY_FOLDER = "parity"
+# Settings of a training that the plan sets, and the setting of `snarf reproduce` to give instead.
+_OWN_SETTINGS = {
+    "subject": "subjects=[...]", "seed": "seeds=[...]", "run": "no name: runs are named after their row", "data": "data=NAME",
+    "training": "training=NAME", "data_root": "data_root=...", "output_root": "output_root=...", "device": "device=...",
+    "threads": "threads=...", "resume": "nothing: runs are always resumed", "overwrite": "another output_root",
+}  # fmt: skip
+
+Resolve = Callable[[Sequence[str]], dict[str, Any]]
+"""Returns the configuration of `snarf train` for overrides, without the settings that do not change the avatar.
+
+Raises UserError for an override that does not fit."""
+
+
+def choose_experiments(what: str | None, options: ExperimentOptions) -> list[tuple[Experiment, ExperimentOptions]]:
+    """Return the experiments that a name stands for, each with the options that apply to it.
+
+    With `all`, data, subjects and training are options of the tables of bodies. The 2D stick keeps its own. The clothed
+    experiment uses CAPE if a licensed data set is given, and the built-in garment otherwise.
+
+    Raises:
+        UserError: there is no such experiment, or no experiment has one of the systems.
+    """
+    names = (*EXPERIMENTS, "all")
+    if what is None:
+        raise UserError(f"what: wanted {alternatives(names)}, got none; give it, such as: snarf reproduce table1")
+    check_choice("what", what, names)
+    if what != "all":
+        return [(EXPERIMENTS[what], options)]
+    chosen = []
+    for experiment in EXPERIMENTS.values():
+        known = tuple(row for row in options.systems if row in {r.key for r in experiment.rows})
+        if options.systems and not known:
+            continue
+        part = replace(options, systems=known)
+        if experiment.name == "stick2d":
+            part = replace(part, data=None, subjects=(), training=None)
+        elif experiment.name == "clothed":
+            licensed = options.data is not None and options.data != "builtin"
+            # The subjects of CAPE are not those of DFaust.
+            part = replace(part, data="cape" if licensed else None, subjects=() if licensed else options.subjects)
+        chosen.append((experiment, part))
+    if not chosen:
+        raise UserError(_unknown_systems(options.systems, [row for one in EXPERIMENTS.values() for row in one.rows]))
+    return chosen
+
+
+def make_plan(experiment: Experiment, options: ExperimentOptions, resolve: Resolve) -> Plan:
+    """Return the plan of one experiment.
+
+    Runs are ordered by seed, then subject, then row, so that a whole table is complete early. All settings and subjects are
+    checked before anything runs.
+
+    Args:
+        experiment: the experiment.
+        options: its data, subjects, seeds, rows and settings.
+        resolve: composes the configuration of `snarf train`.
+
+    Raises:
+        UserError: an option is unknown or cannot be used.
+    """
+    data = options.data or experiment.data[0]
+    if data not in experiment.data:
+        raise UserError(f"data: wanted {alternatives(experiment.data)} for {experiment.name}, got '{data}'")
+    training = options.training or experiment.training
+    presets = group_options("training")
+    if training not in presets:
+        raise UserError(f"there is no training={training}{nearest(training, presets)}; choose from {', '.join(presets)}")
+    rows = _chosen_rows(experiment, options)
+    if len(set(options.seeds)) != len(options.seeds) or not options.seeds or min(options.seeds) < 0:
+        raise UserError(f"seeds: wanted different whole numbers from 0, at least one, got {list(options.seeds)}")
+    _check_extra(options.extra)
+    common = (f"data={data}", f"training={training}")
+    resolved = {}
+    for row in rows:
+        try:
+            resolved[row.key] = resolve((*common, *row.settings(training), *options.extra))
+        except UserError as error:
+            raise UserError(f"row {row.key}: {error}") from None
+    subjects = options.subjects or experiment.subjects.get(data, ())
+    _check_subjects(experiment, data, subjects, options, resolved[rows[0].key]["data"])
+    jobs = tuple(
+        _job(row, data, subject, seed, training, options, resolved[row.key])
+        for seed in options.seeds
+        for subject in subjects
+        for row in rows
+    )
+    preset = resolve((*common, *options.extra))  # without the settings of a row
+    chosen = replace(experiment, rows=tuple(rows))
+    return Plan(chosen, data, tuple(subjects), options.seeds, training, options.extra, jobs, preset["training"])
+
+
+def _chosen_rows(experiment: Experiment, options: ExperimentOptions) -> list[Row]:
+    """Return the rows that `systems=` names, or all rows."""
+    unknown = [key for key in options.systems if key not in [row.key for row in experiment.rows]]
+    if unknown:
+        raise UserError(_unknown_systems(unknown, experiment.rows))
+    return [row for row in experiment.rows if not options.systems or row.key in options.systems]
+
+
+def _job(
+    row: Row, data: str, subject: str, seed: int, training: str, options: ExperimentOptions, resolved: dict[str, Any]
+) -> Job:
+    """Return one run, with the commands of its stages."""
+    # Runs with different settings have different names, so that no table mixes them.
+    name = f"{row.key}-{training}-s{seed}" + (f"-{_digest(list(options.extra))[:6]}" if options.extra else "")
+    folder = run_folder(options.output_root, data, subject, name)
+    root = options.data_root
+    train_root = root if row.inside_test == "winding" else str(Path(root) / _PARITY_FOLDER)
+    machine = (f"device={options.device}", *((f"threads={options.threads}",) if options.threads else ()))
+    where = (_text("output_root", options.output_root), f"run={name}")
+    train = (
+        "train", f"subject={quote(subject)}", f"data={data}", f"training={training}", *row.settings(training), *options.extra,
+        f"seed={seed}", _text("data_root", train_root), *where, *machine, "resume=true",
+    )  # fmt: skip
+    return Job(
+        row=row.key,
+        label=row.label,
+        data=data,
+        subject=subject,
+        seed=seed,
+        folder=str(folder),
+        samples=_samples_stages(data, subject, root, train_root, row.inside_test),
+        train=train,
+        evaluations=_evaluation_stages(data, subject, folder, options, where, machine),
+        digest=_digest([resolved, seed, data, subject, row.inside_test]),
+    )
+
+
+def _samples_stages(data: str, subject: str, root: str, train_root: str, inside_test: str) -> tuple[SamplesStage, ...]:
+    """Return the samples for the evaluations, followed by those for the training if these are labelled differently."""
+
+    def stage(data: str, root: str, *more: str) -> SamplesStage:
+        arguments = ("preprocess", f"subject={quote(subject)}", f"data={data}", _text("data_root", root), *more)
+        return SamplesStage(str(samples_folder(root, data, subject)), arguments)
+
+    ood_data = _OTHER_OOD_DATA.get(data, data)
+    stages = [stage(data, root)]
+    if ood_data != data:
+        stages.append(stage(ood_data, root))
+    if train_root != root:
+        # The samples go below another root than the one that has the files of the data set.
+        files = () if data == "builtin" else (_text("data.folder", root), _text("body", root))
+        stages.append(stage(data, train_root, f"inside_test={inside_test}", *files))
+    return tuple(stages)
+
+
+def _evaluation_stages(
+    data: str, subject: str, folder: Path, options: ExperimentOptions, where: tuple[str, ...], machine: tuple[str, ...]
+) -> tuple[EvaluationStage, ...]:
+    """Return the evaluations in and out of distribution."""
+    settings: dict[str, Any] = {"max_frames": options.max_frames, "surface_frames": options.surface_frames}
+    given = [f"{key}={'null' if value is None else value}" for key, value in settings.items()]
+    part = "_part" if options.max_frames is not None else ""
+    stages = []
+    for split, set_name in (("id", data), ("ood", _OTHER_OOD_DATA.get(data, data))):
+        other = f"_{set_name}" if set_name != data else ""
+        arguments = (
+            "eval", f"subject={quote(subject)}", f"data={set_name}", f"split={split}",
+            _text("data_root", options.data_root), *where, *given, "figure=false", *machine,
+        )  # fmt: skip
+        metrics = folder / f"eval_{split}{other}{part}" / "metrics.json"
+        stages.append(EvaluationStage(split, set_name, options.data_root, arguments, str(metrics), settings))
+    return tuple(stages)
+
+
+def _check_extra(extra: Sequence[str]) -> None:
+    """Check that the further settings are not among those that the plan sets itself."""
+    for override in extra:
+        name = override.partition("=")[0].lstrip("+")
+        if name in _OWN_SETTINGS:
+            raise UserError(f"extra: {name} is set by reproduce itself; give {_OWN_SETTINGS[name]}")
+
+
+def _check_subjects(
+    experiment: Experiment, data: str, subjects: Sequence[str], options: ExperimentOptions, config: dict[str, Any]
+) -> None:
+    """Check that every subject has samples, or meshes to make them from."""
+    request = Request(DataConfig(**config), Path(options.data_root))
+    missing = [one for one in subjects if not (samples_folder(options.data_root, data, one) / "manifest.json").exists()]
+    if subjects and not missing:
+        return
+    known = tuple(find_source(data).subjects(request))
+    if not subjects:
+        raise UserError(f"{experiment.name} on data={data} needs subjects=[...]; it has {', '.join(known) or 'none'}")
+    for subject in missing:
+        if subject not in known:
+            raise UserError(f"data={data} has no subject '{subject}'{nearest(subject, known)}; it has {', '.join(known)}")
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _text(name: str, value: str) -> str:
+    return f"{name}={quote(value)}"
+
+
+def _unknown_systems(keys: Sequence[str], rows: Sequence[Row]) -> str:
+    known = list(dict.fromkeys(row.key for row in rows))
+    return f"systems: there is no row '{keys[0]}'{nearest(keys[0], known)}; choose from {', '.join(known)}"

@@ -1,4 +1,4 @@
-"""Pose sequences: files of many kinds and the built-in motions."""
+"""Pose sequences: readers for motion files, retargeting, and the built-in motions."""
 
 from snarfcli.motions.body_shape import read_shape
 from snarfcli.motions.builtin import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, builtin_motion

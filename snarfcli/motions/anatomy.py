@@ -1,12 +1,12 @@
-"""From anatomical angles to poses: a small human figure with joint limits, planted feet and a floor.
+"""Convert anatomical angles to SMPL poses, with joint limits, for a figure of an average adult.
 
-Built-in motions are written in angles that a physiotherapist would use, in degrees, one array [T] for each name of
-`LIMITS_DEG`; names that are missing are zero. Zero everywhere is a straight stand, arms hanging, palms inwards.
+Built-in motions are written in anatomical angles, in degrees, one array [T] per name of `LIMITS_DEG`; missing angles are zero.
+All zero is standing straight with hanging arms and palms inwards.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ Angles = Mapping[str, Array]
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 """SMPL's joint tree."""
 
-# An average adult in a T-pose, y up, facing +z, left is +x, metres. Only the motions' floor and planted feet use it.
+# An average adult in a T-pose, y up, facing +z, left is +x, metres. Used only for the floor and planted feet of motions.
 JOINTS_REST = np.array(
     [
         (0, -0.220, 0.030), (0.110, -0.312, 0.060), (-0.110, -0.312, 0.060), (0, -0.150, 0.044),
@@ -33,8 +33,8 @@ JOINTS_REST = np.array(
 )  # fmt: skip
 
 
-# Ranges of motion in degrees. Passive ranges of supple adults, since the extremes come close to them; every day's motion
-# stays far inside (American Academy of Orthopaedic Surgeons' tables give hip flexion 120, knee 135, shoulder 180, elbow 150).
+# Ranges of motion in degrees: passive ranges of flexible adults, since the extremes come close to them; everyday motion stays
+# far inside (tables of the American Academy of Orthopaedic Surgeons: hip flexion 120, knee 135, shoulder 180, elbow 150).
 _UNPAIRED = {
     "pelvis_tilt": (-180, 180), "pelvis_list": (-180, 180), "pelvis_turn": (-180, 180),
     "spine_flex": (-60, 80), "spine_bend": (-40, 40), "spine_twist": (-50, 50),
@@ -50,7 +50,7 @@ LIMITS_DEG: dict[str, tuple[float, float]] = {
     **_UNPAIRED,
     **{f"{side}_{name}": limits for side in "lr" for name, limits in _PAIRED.items()},
 }
-"""Lowest and highest value of every angle, degrees.
+"""Minimum and maximum of every angle, degrees.
 
 Signs. pelvis and spine: tilt/flex forwards, list/bend to the left, turn/twist to the left; head likewise. hip: flexion
 (knee up), abduction (out), external rotation. knee: flexion. ankle: toes up. toe: up. shrug: up. protract: forwards. arm:
@@ -58,7 +58,7 @@ Signs. pelvis and spine: tilt/flex forwards, list/bend to the left, turn/twist t
 pron: pronation. wrist: towards the palm, towards the thumb. curl: fingers towards the palm.
 """
 
-# Twist of the forearm is shared by elbow and wrist, or the skin of the wrist would wring.
+# Elbow and wrist share the twist of the forearm; otherwise the skin of the wrist would collapse.
 _PRONATION_AT_ELBOW = 0.45
 _SPINE_SHARES = {3: 0.3, 6: 0.35, 9: 0.35}
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
@@ -69,12 +69,16 @@ def _axis(axis: str, degrees: Array) -> Rotation:
 
 
 def _swing(flex: Array, abd: Array) -> Rotation:
-    """Turn about a horizontal axis: a hanging left limb goes forwards by `flex` and outwards (+x) by `abd` degrees."""
+    """Return the swing of a hanging left limb by `flex` degrees forwards and `abd` degrees outwards (+x)."""
     return Rotation.from_rotvec(np.stack([-flex, np.zeros_like(flex), abd], -1), degrees=True)
 
 
-def _left_arm(get) -> dict[int, Rotation]:
-    """Return collar, shoulder, elbow, wrist and hand of the left arm, each relative to its parent."""
+def _left_arm(get: Callable[[str], Array]) -> dict[int, Rotation]:
+    """Return the rotations of collar, shoulder, elbow, wrist and hand of the left arm, each relative to its parent.
+
+    Args:
+        get: returns the angle of a name without side, [T], degrees.
+    """
     flex, abd = get("arm_flex"), get("arm_abd")
     elevation = np.hypot(flex, abd)
     # The shoulder blade follows the raised arm (scapulohumeral rhythm, about one degree in three beyond 30).
@@ -93,9 +97,9 @@ def _left_arm(get) -> dict[int, Rotation]:
     }
 
 
-def _left_leg(get) -> dict[int, Rotation]:
-    """Return hip, knee, ankle and foot of the left leg, each relative to its parent."""
-    # The rest pose stands with its ankles apart, about 9 degrees a side: zero abduction is a vertical leg.
+def _left_leg(get: Callable[[str], Array]) -> dict[int, Rotation]:
+    """Return the rotations of hip, knee, ankle and foot of the left leg, each relative to its parent; `get` as above."""
+    # In the rest pose the legs are apart, about 9 degrees per side; zero abduction is a vertical leg.
     return {
         1: _swing(get("hip_flex"), get("hip_abd") - 9) * _axis("y", get("hip_rot")),
         4: _axis("x", get("knee")),
@@ -105,21 +109,21 @@ def _left_leg(get) -> dict[int, Rotation]:
 
 
 def poses_from_angles(angles: Angles, frames: int) -> Array:
-    """Turn anatomical angles into poses.
+    """Convert anatomical angles to poses.
 
     Args:
-        angles: name of `LIMITS_DEG` to degrees [T]; values outside the limits are clipped.
-        frames: T.
+        angles: [T] per name of `LIMITS_DEG`, degrees; values outside the limits are clipped.
+        frames: number T of frames.
 
     Returns:
-        [T, 24, 3] axis-angle, radians.
+        [T, 24, 3], axis-angle, radians.
 
     Raises:
-        ValueError: an angle's name is unknown.
+        ValueError: the name of an angle is unknown.
     """
     unknown = sorted(set(angles) - set(LIMITS_DEG))
     if unknown:
-        raise ValueError(f"angles: {', '.join(unknown)} unknown; known are {', '.join(LIMITS_DEG)}")
+        raise ValueError(f"angles: wanted names of {', '.join(LIMITS_DEG)}; got {', '.join(unknown)}")
 
     def get(name: str) -> Array:
         return np.clip(np.broadcast_to(angles.get(name, 0.0), frames), *LIMITS_DEG[name]).astype(np.float64)
@@ -143,7 +147,7 @@ def poses_from_angles(angles: Angles, frames: int) -> Array:
         for joint, rotation in {**_left_leg(of_side), **_left_arm(of_side)}.items():
             if side == "l":
                 local[joint] = rotation
-            else:  # right joints follow their left ones in SMPL's order
+            else:  # in SMPL's order each right joint follows its left one
                 local[joint + 1] = Rotation.from_matrix(_MIRROR @ rotation.as_matrix() @ _MIRROR)
     return np.stack([local[joint].as_rotvec() for joint in range(24)], 1)
 
@@ -152,11 +156,12 @@ def joint_positions(poses: Array, translation: Array | None = None) -> tuple[Arr
     """Pose the average adult.
 
     Args:
-        poses: [T, 24, 3] axis-angle, radians.
-        translation: [T, 3] metres; none by default.
+        poses: [T, 24, 3], axis-angle, radians.
+        translation: [T, 3], metres; none by default.
 
     Returns:
-        joints [T, 24, 3] metres, and their global rotations [T, 24, 3, 3].
+        positions: [T, 24, 3], joints, metres.
+        rotations: [T, 24, 3, 3], global rotations of the joints.
     """
     local = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(len(poses), 24, 3, 3)
     rotations, positions = np.empty_like(local), np.empty_like(poses)

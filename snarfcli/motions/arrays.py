@@ -1,4 +1,4 @@
-"""What the arrays of a pose file mean: poses in any layout, translation, frame rate."""
+"""Interpret the arrays of a pose file: poses in any layout, translation, frame rate."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ __all__ = ["DEFAULT_FRAME_RATE", "MAX_POSE_BYTES", "POSE_KEYS", "motion_from_arr
 log = logging.getLogger(__name__)
 
 DEFAULT_FRAME_RATE = 60.0
-"""Of files that do not say: that of DFaust, CAPE and AIST++."""
+"""Frames per second of files without a frame rate: that of DFaust, CAPE and AIST++."""
 MAX_POSE_BYTES = 2**28
-"""What the arrays of a pose file may take, as stored."""
-_MOST_VALUES = 2**24  # 35 minutes of SMPL-H at 50 frames a second
+"""Maximum size of the arrays of a pose file, as stored."""
+_MAX_VALUES = 2**24  # 35 minutes of SMPL-H at 50 frames per second
 _POSES = ("poses", "pose", "smpl_poses")
 _TRANSLATIONS = ("trans", "transl", "translation", "smpl_trans")
 _FRAME_RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "fps")
@@ -37,36 +37,36 @@ _PARTS = {
     "pose_eye": ("l_eye", "r_eye"),
 }
 POSE_KEYS = (*_POSES, *_TRANSLATIONS, "smpl_scaling", *_FRAME_RATES, *_PARTS, "up", "gender")
-"""Names of all arrays that are looked at; gender is not used, but pickled objects in its place are refused."""
-# Axis-angle of a joint stays below pi, and below twice that if somebody unrolled it. In degrees some joint of a body is
-# further from straight than these 12.6 in nearly every frame. The root is left out: dancers turn and turn.
+"""Names of all arrays that are read; gender is not used, but pickled objects in its place are rejected."""
+# Angles of joints are below pi, or below 2 pi if unwrapped. In degrees, some joint of a body exceeds these 12.6 in nearly every
+# frame. The root is left out, since it may rotate several times.
 _DEGREES = 4 * np.pi
-_LARGEST_ANGLE = 1e4
-_LARGEST_WAY_M = 1e6
+_MAX_ANGLE = 1e4
+_MAX_DISTANCE_M = 1e6
 
 
 def motion_from_arrays(
     arrays: Mapping[str, NDArray], skeleton: Skeleton, path: Path, *, name: str, up: Up, hands: str
 ) -> Motion:
-    """Make a motion of the arrays of a pose file.
+    """Return the motion that the arrays of a pose file describe.
 
     Args:
-        arrays: `poses` (T, 3 K), (T, K, 3) or rotation matrices (T, K, 3, 3), or AMASS's parts `root_orient`, `pose_body`
-            and so on; optional: a translation, `smpl_scaling` that divides it, a frame rate, all under the usual names; `up`,
+        arrays: `poses` as [T, 3 K], [T, K, 3] or rotation matrices [T, K, 3, 3], or AMASS's parts `root_orient`, `pose_body`
+            etc. Optional, under their usual names: a translation; `smpl_scaling`, by which it is divided; a frame rate; `up`,
             the text y or z.
-        skeleton: whose poses are wanted.
-        path: file they come from, for messages.
-        name: what the motion is called.
-        up: which way is up in the file; `auto` believes the file's own `up` where it has one.
-        hands: what SMPL's hand joints do where the file has fingers: `rest` or `released`.
+        skeleton: skeleton of the poses to return.
+        path: the file, for messages.
+        name: name of the motion.
+        up: up axis of the file; `auto` uses `up` of the file if present.
+        hands: pose of SMPL's hand joints if the file has fingers: `rest` or `released`.
 
     Raises:
-        UserError: something is missing, has the wrong shape or number of values, is not finite, or is in degrees.
+        UserError: an array is missing, has a wrong shape or number of values, is not finite, or is in degrees.
     """
     values, names, is_amass = _values(arrays, path, _wanted(skeleton))
     frames = len(values)
     if frames == 0:
-        raise UserError(f"pose file {path} has zero frames; give a file with at least one")
+        raise UserError(f"pose file {path}: wanted at least 1 frame, got 0; give another file")
     poses = _of_skeleton(values, names, skeleton, path, hands)
     _check_angles(poses, path)
     key = next((key for key in _TRANSLATIONS if key in arrays), None)
@@ -74,20 +74,21 @@ def motion_from_arrays(
     if key is not None:
         translation = np.atleast_2d(_numbers(arrays[key], key, path))
         if translation.shape != (frames, 3):
-            raise UserError(f"pose file {path}: {key} has shape {list(translation.shape)}, wanted [{frames}, 3]")
+            raise UserError(
+                f"pose file {path}: {key}: wanted shape [{frames}, 3], got {list(translation.shape)}; repair the file"
+            )
         translation = translation / _scaling(arrays, path)
-        if np.abs(translation).max() > _LARGEST_WAY_M:
-            raise UserError(f"pose file {path}: {key} leads over {_LARGEST_WAY_M / 1000:g} km away; wanted metres")
+        if np.abs(translation).max() > _MAX_DISTANCE_M:
+            limit = f"at most {_MAX_DISTANCE_M / 1000:g} km"
+            raise UserError(f"pose file {path}: {key}: wanted metres, {limit}, got more; repair the file")
     frame_rate = _frame_rate(arrays, path)
     if up == "auto":
-        said = str(arrays.get("up", ""))
-        if said in ("y", "z"):
-            up = said
-        elif is_amass and layout_of(skeleton) is not None:
+        up = _declared_up(arrays)
+        if up == "auto" and is_amass and layout_of(skeleton) is not None:
             up = "z"
-        elif "smpl_poses" in arrays:  # AIST++'s world has y up, however its dancers lie
+        elif up == "auto" and "smpl_poses" in arrays:  # AIST++ has y up, also where dancers lie on the floor
             up = "y"
-        else:
+        elif up == "auto":
             up = "y" if key is None else up_axis(Rotation.from_rotvec(poses[:, 0]))
         if up == "z":
             log.info("%s: z is up in this file and was turned to y", path.name)
@@ -97,8 +98,14 @@ def motion_from_arrays(
     return Motion(name, poses, translation, frame_rate)
 
 
+def _declared_up(arrays: Mapping[str, NDArray]) -> Up:
+    """Return the up axis that the file declares; `auto` if it does not."""
+    declared = str(arrays.get("up", ""))
+    return "y" if declared == "y" else "z" if declared == "z" else "auto"
+
+
 def _values(arrays: Mapping[str, NDArray], path: Path, wanted: str) -> tuple[NDArray[np.float64], tuple[str, ...], bool]:
-    """Return poses [T, K, 3], the names of the K joints if the file says which they are, and whether it is AMASS's."""
+    """Return the poses [T, K, 3], the names of the K joints (empty if unknown), and whether the file is from AMASS."""
     key = next((key for key in _POSES if key in arrays), None)
     if key is None:
         return _from_parts(arrays, path), (*BODY_JOINTS, *FINGER_JOINTS, "jaw", "l_eye", "r_eye"), True
@@ -112,9 +119,9 @@ def _values(arrays: Mapping[str, NDArray], path: Path, wanted: str) -> tuple[NDA
     if values.ndim == 1 and len(values):
         values = values[None]
     if values.ndim != 2:
-        raise UserError(f"pose file {path}: {key} has shape {list(values.shape)}, wanted [frames, values]")
+        raise UserError(f"pose file {path}: {key}: wanted shape [frames, values], got {list(values.shape)}; repair the file")
     if values.shape[1] % 3 or not values.shape[1]:
-        raise UserError(f"pose file {path} has {values.shape[1]} values a frame, wanted {wanted}")
+        raise UserError(f"pose file {path}: wanted {wanted} values per frame, got {values.shape[1]}; give another file")
     poses = values.reshape(len(values), values.shape[1] // 3, 3)
     return poses, (), values.shape[1] in (156, 165)
 
@@ -123,17 +130,18 @@ def _from_matrices(matrices: NDArray[np.float64], key: str, path: Path) -> NDArr
     flat = matrices.reshape(-1, 3, 3)
     error = np.abs(flat @ flat.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
     if error > 1e-3 or (np.linalg.det(flat) < 0).any():
-        raise UserError(f"pose file {path}: {key} has shape {list(matrices.shape)}, but does not hold rotation matrices")
+        shape = list(matrices.shape)
+        raise UserError(f"pose file {path}: {key}: wanted rotation matrices, got others of shape {shape}; repair the file")
     turns = Rotation.from_matrix(flat).as_rotvec() if len(flat) else np.zeros((0, 3))
     return turns.reshape(*matrices.shape[:2], 3)
 
 
 def _from_parts(arrays: Mapping[str, NDArray], path: Path) -> NDArray[np.float64]:
-    """Return poses [T, 55, 3] of body, fingers and face from AMASS's parts; parts that are missing stay straight."""
+    """Return the poses [T, 55, 3] of body, fingers and face from AMASS's parts; missing parts are zero."""
     missing = [key for key in ("root_orient", "pose_body") if key not in arrays]
     if missing:
-        found = ", ".join(sorted(arrays)) or "nothing of use"
-        raise UserError(f"pose file {path} has no 'poses'; it holds {found}; give an AMASS-style file")
+        found = ", ".join(sorted(arrays)) or "no pose arrays"
+        raise UserError(f"pose file {path}: wanted 'poses', got {found}; give an AMASS-style file")
     frames = np.atleast_2d(arrays["root_orient"]).shape[0]
     parts = []
     for key, joints in _PARTS.items():
@@ -142,7 +150,8 @@ def _from_parts(arrays: Mapping[str, NDArray], path: Path) -> NDArray[np.float64
             values = np.atleast_2d(_numbers(arrays[key], key, path))
             if values.size != frames * 3 * len(joints):
                 shape = list(arrays[key].shape)
-                raise UserError(f"pose file {path}: {key} has shape {shape}, wanted [{frames}, {3 * len(joints)}]")
+                wanted = [frames, 3 * len(joints)]
+                raise UserError(f"pose file {path}: {key}: wanted shape {wanted}, got {shape}; repair the file")
         parts.append(values.reshape(frames, -1, 3) if frames else np.zeros((0, len(joints), 3)))
     return np.concatenate(parts, 1)
 
@@ -157,12 +166,13 @@ def _of_skeleton(
             return values.copy()
         names = BODY_JOINTS if values.shape[1] == len(BODY_JOINTS) else LAYOUTS.get(values.shape[1], ())
     if wanted is None or not names:
-        raise UserError(f"pose file {path} has {3 * values.shape[1]} values a frame, wanted {_wanted(skeleton)}")
+        got = 3 * values.shape[1]
+        raise UserError(f"pose file {path}: wanted {_wanted(skeleton)} values per frame, got {got}; give another file")
     return carry_over(values, names, wanted, hands)
 
 
 def _wanted(skeleton: Skeleton) -> str:
-    """Say which numbers of values can be read."""
+    """Return the accepted numbers of values per frame, for messages."""
     if layout_of(skeleton) is None:
         return str(3 * skeleton.num_joints)
     return "72 (SMPL), 156 (SMPL-H) or 165 (SMPL-X)"
@@ -171,39 +181,40 @@ def _wanted(skeleton: Skeleton) -> str:
 def _check_angles(poses: NDArray[np.float64], path: Path) -> None:
     largest = np.abs(poses).max()
     if poses.shape[1] > 1 and np.median(np.abs(poses[:, 1:]).max((1, 2))) > _DEGREES:
-        raise UserError(f"pose file {path}: the poses look like degrees, up to {largest:.5g}; save them in radians")
-    if largest > _LARGEST_ANGLE:
-        raise UserError(f"pose file {path}: the poses hold {largest:.5g}, which is no angle in radians; repair the file")
+        raise UserError(f"pose file {path}: wanted angles in radians, got degrees, up to {largest:.5g}; save them in radians")
+    if largest > _MAX_ANGLE:
+        raise UserError(f"pose file {path}: wanted angles in radians, got {largest:.5g}; repair the file")
 
 
 def _numbers(array: NDArray, name: str, path: Path) -> NDArray[np.float64]:
     if array.dtype.kind not in "fiu":
-        raise UserError(f"pose file {path}: {name} holds {array.dtype}, wanted numbers")
-    if array.size > _MOST_VALUES:
-        raise UserError(f"pose file {path}: {name} has {array.size} values, more than {_MOST_VALUES}; cut it into parts")
+        raise UserError(f"pose file {path}: {name}: wanted numbers, got {array.dtype}; repair the file")
+    if array.size > _MAX_VALUES:
+        raise UserError(f"pose file {path}: {name}: wanted at most {_MAX_VALUES} values, got {array.size}; cut it into parts")
     with np.errstate(over="ignore"):
         values = array.astype(np.float64)
     broken = ~np.isfinite(values)
     if broken.any():
         frame = int(np.argwhere(broken)[0][0]) if array.ndim > 1 else 0
-        raise UserError(f"pose file {path}: {name} holds NaN or infinity, first in frame {frame}; repair or cut the file")
+        wanted = "wanted finite numbers, got NaN or infinity"
+        raise UserError(f"pose file {path}: {name}: {wanted}, first in frame {frame}; repair or cut the file")
     return values
 
 
 def _positive(array: NDArray, key: str, path: Path) -> float:
     if array.dtype.kind not in "fiu" or array.size != 1 or not np.isfinite(array).all() or not 1e-6 < array.item() < 1e6:
-        raise UserError(f"pose file {path}: {key} must be one positive number")
+        raise UserError(f"pose file {path}: {key}: wanted one positive number, got other values; repair the file")
     return float(array.item())
 
 
 def _scaling(arrays: Mapping[str, NDArray], path: Path) -> float:
-    """Return what AIST++'s translation is to be divided by; 1 for other files."""
+    """Return the divisor of AIST++'s translation; 1 for other files."""
     return _positive(arrays["smpl_scaling"], "smpl_scaling", path) if "smpl_scaling" in arrays else 1.0
 
 
 def _frame_rate(arrays: Mapping[str, NDArray], path: Path) -> float:
     key = next((key for key in _FRAME_RATES if key in arrays), None)
     if key is None:
-        log.info("%s: no frame rate given, %g frames a second assumed", path.name, DEFAULT_FRAME_RATE)
+        log.info("%s: no frame rate given, %g frames per second assumed", path.name, DEFAULT_FRAME_RATE)
         return DEFAULT_FRAME_RATE
     return _positive(arrays[key], key, path)

@@ -1,4 +1,4 @@
-"""Curves in time: noise, pulses, hops and smooth ways between key values. All depend on time alone, not on the frame rate."""
+"""Curves over time: noise, pulses, hops and interpolation of key values. They depend on time only, not on the frame rate."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _GRAVITY = 9.81
 
 
 def smooth_noise(rng: np.random.Generator, t: Array, slowest_hz: float = 0.15, fastest_hz: float = 1.2) -> Array:
-    """Return noise [T] of unit standard deviation: seven sines of random phase, weaker the faster they are."""
+    """Return noise [T] of unit standard deviation: seven sines of random phase with amplitudes that fall with frequency."""
     frequencies = np.geomspace(slowest_hz, fastest_hz, 7) * rng.uniform(0.85, 1.15, 7)
     weights = frequencies**-0.5
     weights *= np.sqrt(2 / np.sum(weights**2))
@@ -25,17 +25,17 @@ def smooth_noise(rng: np.random.Generator, t: Array, slowest_hz: float = 0.15, f
 
 
 def pulse(phase: Array, centre: float, width: float) -> Array:
-    """Return a smooth bump [T] of height 1, once a cycle of `phase` (in cycles), `width` cycles wide at its foot."""
+    """Return a smooth bump [T] of height 1, once per cycle of `phase` (in cycles); its support is `width` cycles wide."""
     distance = np.abs((phase - centre + 0.5) % 1.0 - 0.5) / (width / 2)
     return np.where(distance < 1, 0.5 + 0.5 * np.cos(np.pi * np.minimum(distance, 1)), 0.0)
 
 
 def hop(phase: Array, period_s: float, height_m: float) -> tuple[Array, Array]:
-    """Return the vertical way of a hopping body, once a cycle of `phase` (in cycles).
+    """Return the vertical motion of a hopping body, one hop per cycle of `phase` (in cycles).
 
     Returns:
-        lift [T] metres: a ballistic arc in flight, and the dip on the ground that joins it without a kink; and the leg's
-        extension [T], 1 in flight, 0 in the middle of the contact.
+        lift: [T], height, metres: a ballistic arc in flight, joined smoothly to a dip on the ground.
+        extension: [T], extension of the leg: 1 in flight, 0 in the middle of the contact.
     """
     flight_s = np.sqrt(8 * height_m / _GRAVITY)
     share = min(flight_s / period_s, 0.8)
@@ -49,23 +49,23 @@ def hop(phase: Array, period_s: float, height_m: float) -> tuple[Array, Array]:
     return np.where(in_flight, 4 * height_m * w * (1 - w), -dip * sunk), 1 - sunk
 
 
-def through(t: Array, times: Sequence[float], values: Sequence[float]) -> Array:
-    """Return a smooth curve [T] through key values that never overshoots them and rests where two are equal."""
+def through(t: Array, times: Sequence[float] | Array, values: Sequence[float] | Array) -> Array:
+    """Return a smooth curve [T] through key values, without overshoot; constant between two equal values."""
     return PchipInterpolator(np.asarray(times, float), np.asarray(values, float))(np.clip(t, times[0], times[-1]))
 
 
 class Style:
-    """How one person moves: a seeded source of sizes, tempos and phases. The order of the draws is the seed's meaning."""
+    """Seeded random numbers for the amplitudes, tempos and phases of a motion. The order of the draws must not change."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
 
     def around(self, value: float, spread: float = 0.15) -> float:
-        """Return `value` times one plus or minus up to `spread`."""
+        """Return `value` times a random factor between 1 - `spread` and 1 + `spread`."""
         return value * (1 + spread * self.rng.uniform(-1, 1))
 
     def between(self, low: float, high: float) -> float:
-        """Return a number between two."""
+        """Return a random number between two."""
         return float(self.rng.uniform(low, high))
 
     def noise(self, t: Array, size: float, slowest_hz: float = 0.15, fastest_hz: float = 1.2) -> Array:
@@ -73,6 +73,6 @@ class Style:
         return size * smooth_noise(self.rng, t, slowest_hz, fastest_hz)
 
     def phase(self, t: Array, tempo_hz: float) -> Array:
-        """Return the phase [T] in cycles of a beat that starts anywhere and keeps time as people do, within about 3 %."""
+        """Return the phase [T], in cycles, of a beat with random start; its tempo varies by about 3 %, as in human motion."""
         start = self.rng.uniform()
         return start + tempo_hz * t + 0.025 * smooth_noise(self.rng, t, 0.15, 0.6)

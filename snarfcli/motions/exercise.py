@@ -1,4 +1,4 @@
-"""What a figure does, before it becomes poses, and the stand that every exercise starts from."""
+"""An exercise as joint angles and root track, before conversion to poses, and the stand that exercises start from."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Exercise:
-    """What a figure does, before it becomes poses."""
+    """Joint angles and tracks of pelvis and feet over time."""
 
     angles: dict[str, Array]
-    """Degrees [T] by name."""
+    """[T] per name of `anatomy.LIMITS_DEG`, degrees."""
     pelvis: Array
-    """[T, 3] metres from where the pelvis of a straight stand is. Without planted feet: above the floor."""
+    """[T, 3], offset of the pelvis from standing straight, metres; added to the height on the floor if no foot is planted."""
     feet: dict[str, FootPath] = field(default_factory=dict)
-    """Paths of planted feet, by side; the other legs follow the angles. With none the lowest point touches the floor."""
+    """Paths of planted feet by side, `l` or `r`; other legs follow the angles. If empty, the lowest point touches the floor."""
 
 
 def stand(style: Style, t: Array) -> Exercise:
-    """Someone standing at ease: arms hanging, a little sway, never quite still and never quite symmetric."""
+    """Return a relaxed stand with hanging arms, a slight sway, small motions and slight asymmetry."""
     zero = np.zeros_like(t)
     angles = {
         "pelvis_tilt": style.between(0, 4) + style.noise(t, 1.0),
@@ -63,6 +63,6 @@ def stand(style: Style, t: Array) -> Exercise:
 
 
 def add(exercise: Exercise, **angles: Array | float) -> None:
-    """Add degrees, a number or one a frame, to angles of the exercise."""
+    """Add degrees, constant or [T], to angles of the exercise."""
     for name, value in angles.items():
-        exercise.angles[name] = exercise.angles.get(name, 0.0) + value
+        exercise.angles[name] = np.add(exercise.angles.get(name, 0.0), value)

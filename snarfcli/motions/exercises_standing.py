@@ -1,6 +1,6 @@
-"""Exercises with both feet on the floor.
+"""Exercises with both feet on the floor, in anatomical angles (see `anatomy`).
 
-In anatomical angles (see `anatomy`); each procedure stands in for the DFaust sequence of its name.
+Each function imitates the DFaust sequence of its name.
 """
 
 from __future__ import annotations
@@ -199,4 +199,4 @@ STANDING_EXERCISES: dict[str, Callable[[Style, Array], Exercise]] = {
     "shake_hips": _shake_hips,
     "shake_shoulders": _shake_shoulders,
 }
-"""Procedures by name of the DFaust sequence."""
+"""Functions by name of the DFaust sequence."""

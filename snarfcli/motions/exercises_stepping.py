@@ -1,6 +1,6 @@
-"""Exercises that hop, step or stand on one leg.
+"""Exercises with hops, steps or standing on one leg, in anatomical angles (see `anatomy`).
 
-In anatomical angles (see `anatomy`); each procedure stands in for the DFaust sequence of its name.
+Each function imitates the DFaust sequence of its name.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _TURN = 2 * np.pi
 
 
 def _hopping(exercise: Exercise, lift: Array, extension: Array, sides: str = "lr", point_deg: float = 30.0) -> None:
-    """Move pelvis and feet up and down with a hop on the balls of the feet, which point at the floor in flight."""
+    """Move pelvis and feet with a hop on the balls of the feet; in flight the toes point at the floor."""
     exercise.pelvis[:, 1] += lift + 0.0017 * point_deg  # a lifted heel lengthens the leg
     for side in sides:
         foot = exercise.feet[side]
@@ -32,7 +32,7 @@ def _jumping_jacks(style: Style, t: Array) -> Exercise:
     exercise = stand(style, t)
     tempo = style.around(0.95, 0.1)
     phase = style.phase(t, tempo)
-    # Two hops a cycle: legs go apart in the first flight, together in the second.
+    # Two hops per cycle: legs go apart in the first flight, together in the second.
     lift, extension = hop(2 * phase, 0.5 / tempo, style.around(0.045, 0.25))
     opened = 0.5 - 0.5 * np.cos(_TURN * (phase - 0.09))
     _hopping(exercise, lift, extension)
@@ -62,7 +62,7 @@ def _knees(style: Style, t: Array) -> Exercise:
     for side, other, delay in (("l", "r", 0.0), ("r", "l", 0.5)):
         raised = pulse(phase, delay + 0.25, 0.5)
         foot = exercise.feet[side]
-        # the knee rises in front, its shank hanging: the foot's way is that of the ball below a bent leg
+        # the knee rises in front with a hanging shank: the path of the foot is that of the ball below a bent leg
         foot.y = foot.y + style.around(0.46, 0.1) * raised * height / 88
         foot.z = foot.z + (0.20 + style.between(-0.04, 0.04)) * raised
         foot.heel = foot.heel + style.around(28, 0.4) * raised
@@ -103,7 +103,7 @@ def _light_hopping(style: Style, t: Array, loose: float) -> Exercise:
 
 
 def _on_one_leg(style: Style, t: Array, exercise: Exercise) -> tuple[str, str, int]:
-    """Shift the weight over one foot, for good: the pelvis above it, the trunk upright. Returns stance, free side, sign."""
+    """Shift the weight over one foot, trunk upright; return the stance side, the free side and the sign of x."""
     stance, free, sign = ("l", "r", 1) if style.rng.uniform() < 0.5 else ("r", "l", -1)
     foot = exercise.feet[stance]
     foot.x = foot.x * 0 - sign * 0.02
@@ -180,7 +180,7 @@ def _running_on_spot(style: Style, t: Array) -> Exercise:
         foot.z = foot.z + 0.12 * swing - heel_back * late
         foot.heel = foot.heel + 12 + style.around(44, 0.15) * late
         foot.yaw = foot.yaw * 0.5
-        beat = np.cos(_TURN * (phase - delay - 0.25))  # this arm goes back when this knee is up
+        beat = np.cos(_TURN * (phase - delay - 0.25))  # the arm swings back when the knee of its side is up
         exercise.angles |= {
             f"{side}_arm_flex": 4 - pump * beat + style.noise(t, 2),
             f"{side}_arm_abd": style.around(24, 0.15) + style.noise(t, 2),
@@ -203,4 +203,4 @@ STEPPING_EXERCISES: dict[str, Callable[[Style, Array], Exercise]] = {
     "one_leg_loose": _one_leg_loose,
     "running_on_spot": _running_on_spot,
 }
-"""Procedures by name of the DFaust sequence."""
+"""Functions by name of the DFaust sequence."""

@@ -1,4 +1,4 @@
-"""Poses near the limits of the joints, joined into smooth sequences, in anatomical angles (see `anatomy`)."""
+"""Smooth sequences of poses near the limits of the joints, in anatomical angles (see `anatomy`)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Pose = Mapping[str, float]
 
 
 def _both(**angles: float) -> dict[str, float]:
-    """Give both sides the same angles."""
+    """Return the same angles for both sides."""
     return {f"{side}_{name}": value for name, value in angles.items() for side in "lr"}
 
 
 _EASE = _both(hip_abd=6, arm_abd=16, elbow=16, curl=18, pron=10)
 
-# Every pose is written for one side; `_mirrored` makes the other. Angles not named are those of `_EASE`.
+# Every pose is written for one side; `_mirrored` gives the other. Angles that are not named are those of `_EASE`.
 POSES: dict[str, Pose] = {
     "stand": {},
     "side_split": {**_both(hip_abd=78, hip_rot=35, ankle=-35, arm_abd=95, elbow=8), "spine_flex": 6, "pelvis_tilt": 20},
@@ -155,7 +155,7 @@ EXTREMES: dict[str, tuple[str, ...]] = {
     "lunges": ("lunge", "lunge_twist", "arabesque", "knee_to_chest", "-lunge_twist", "-lunge"),
     "sits_and_twists": ("stand", "twist", "-side_bend", "forward_fold", "sit", "cross_legged", "long_sit_reach"),
 }  # fmt: skip
-"""Key poses of each sequence; a minus sign asks for the mirrored pose."""
+"""Key poses of each sequence; a minus sign means the mirrored pose."""
 
 
 def _mirrored(pose: Pose) -> dict[str, float]:
@@ -173,10 +173,10 @@ def _key_pose(name: str) -> Pose:
 
 
 def perform(keys: Sequence[str], style: Style, t: Array, duration_s: float) -> Exercise:
-    """Move smoothly from key pose to key pose, dwelling in each, with a person's own extent and timing."""
+    """Move smoothly from key pose to key pose, holding each, with extent and timing varied by `style`."""
     poses = [_key_pose(name) for name in keys]
     parts = np.array([style.around(1.0, 0.2) for _ in keys])
-    parts[-1] *= 0.5  # nothing follows the last one, so all of it is dwelling
+    parts[-1] *= 0.5  # the last pose has no transition after it
     ends = np.cumsum(parts) / parts.sum() * duration_s
     times = np.stack([np.concatenate([[0], ends[:-1]]), ends - 0.72 * parts / parts.sum() * duration_s], 1).ravel()
     times = np.append(times, duration_s)

@@ -1,4 +1,4 @@
-"""Feet on the floor: inverse kinematics of planted legs, and the floor under any pose."""
+"""Contact with the floor: inverse kinematics of planted legs, and the floor below any pose."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Array = NDArray[np.float64]
 FLOOR_Y = -1.17
 """Height of the soles in the rest pose, metres."""
 
-# A knee never locks: the leg's reach is eased into this share of its full length, where the solution would turn singular.
+# The reach of a leg smoothly approaches this share of its full length, at which the solution would become singular.
 _REACH = 0.997
 _EASE_M = 0.006
 
 # Width of the soft minimum that finds the lowest point, metres.
 _SOFT_M = 0.008
 
-# How long a body takes to come to rest on the floor, seconds.
-_GIVE_S = 0.04
+# Time over which the contact with the floor is smoothed, seconds.
+_SMOOTHING_S = 0.04
 
-# Points that can touch the floor: joint, offset in the joint's frame, radius of the flesh around it, metres.
+# Points that can touch the floor: joint, offset in the frame of the joint, radius of the body around it, metres.
 _CONTACTS = (
     *((ankle, (0.0, -0.035, -0.055), 0.03) for ankle in (7, 8)),
     *((foot, offset, 0.012) for foot in (10, 11) for offset in ((0.02, -0.008, 0.06), (-0.03, -0.008, 0.07), (0, -0.01, 0))),
@@ -48,31 +48,31 @@ _CONTACTS = (
 
 @dataclass
 class FootPath:
-    """Where one foot is, frame by frame, in the world of a body that stands at its rest position."""
+    """Path of the ball of one foot, relative to its position when standing straight."""
 
     x: Array
-    """[T] ball of the foot, metres to the body's left of where it stands."""
+    """[T], offset to the left of the body, metres."""
     y: Array
-    """[T] metres above the floor."""
+    """[T], height above the floor, metres."""
     z: Array
-    """[T] metres forwards of where it stands."""
+    """[T], offset forwards, metres."""
     yaw: Array
-    """[T] toes turned outwards, degrees."""
+    """[T], outward rotation of the toes, degrees."""
     heel: Array
-    """[T] heel lifted above the ball, degrees."""
+    """[T], lift of the heel above the ball, degrees."""
 
 
 def plant_foot(poses: Array, translation: Array, side: str, path: FootPath) -> Array:
-    """Turn hip, knee, ankle and toes of one leg so that the foot follows a path; the knee points where the toes do.
+    """Rotate hip, knee, ankle and toes of one leg so that the foot follows a path; the knee points where the toes do.
 
     Args:
-        poses: [T, 24, 3] axis-angle, radians.
-        translation: [T, 3] metres of the root.
+        poses: [T, 24, 3], axis-angle, radians.
+        translation: [T, 3], translation of the root, metres.
         side: `l` or `r`.
-        path: the ball's way; a foot that cannot be reached hangs in the air below a straight leg.
+        path: path of the foot; if it is out of reach, the leg is straight and the foot stays in the air.
 
     Returns:
-        [T, 24, 3] the poses with this leg replaced.
+        [T, 24, 3], the poses with this leg replaced, axis-angle, radians.
     """
     right = side == "r"
     sign = -1.0 if right else 1.0
@@ -107,7 +107,7 @@ def plant_foot(poses: Array, translation: Array, side: str, path: FootPath) -> A
 
 
 def _frame(along: Array, towards: Array) -> Array:
-    """Orthonormal frames [T, 3, 3] whose first column is `along` and whose second leans `towards`."""
+    """Return orthonormal frames [T, 3, 3]; the first column is along `along`, the second close to `towards`."""
     first = along / np.linalg.norm(along, axis=1, keepdims=True)
     second = towards - (first * towards).sum(1, keepdims=True) * first
     second /= np.linalg.norm(second, axis=1, keepdims=True)
@@ -115,20 +115,20 @@ def _frame(along: Array, towards: Array) -> Array:
 
 
 def stand_on_floor(poses: Array, frame_rate: float) -> Array:
-    """Return the translation with which the body rests on the floor, and what rests on it does not slide.
+    """Return the translation with which the body stands on the floor without sliding.
 
     Args:
-        poses: [T, 24, 3] axis-angle, radians.
-        frame_rate: frames a second.
+        poses: [T, 24, 3], axis-angle, radians.
+        frame_rate: frames per second.
 
     Returns:
-        [T, 3] metres. Up: the lowest point touches the floor. Sideways and forwards: the points on the floor stay where they
-        are from frame to frame, and the way as a whole is centred.
+        [T, 3], metres. Vertically the lowest point touches the floor; horizontally the points on the floor do not move between
+        frames, and the whole path is centred.
     """
     positions, rotations = joint_positions(poses)
     points = np.stack([positions[:, joint] + rotations[:, joint] @ np.asarray(at) for joint, at, _ in _CONTACTS], 1)
     heights = points[:, :, 1] - np.array([radius for _, _, radius in _CONTACTS])
-    # A soft minimum: no jerk when another point takes over.
+    # A soft minimum avoids jumps when the lowest point changes.
     lowest = -_SOFT_M * np.logaddexp.reduce(-heights / _SOFT_M, axis=1)
     share = np.exp((lowest[:, None] - heights) / (3 * _SOFT_M))
     share /= share.sum(1, keepdims=True)
@@ -136,5 +136,5 @@ def stand_on_floor(poses: Array, frame_rate: float) -> Array:
     translation = -np.concatenate([np.zeros((1, 3)), np.cumsum(slide, 0)])
     translation -= (translation.max(0) + translation.min(0)) / 2
     translation[:, 1] = FLOOR_Y - lowest
-    # A foot that lands or leaves would stop the body dead; flesh and knees give way for a few hundredths of a second.
-    return gaussian_filter1d(translation, _GIVE_S * frame_rate, axis=0, mode="nearest")
+    # Without smoothing, a foot that lands or lifts off would change the velocity of the body abruptly.
+    return gaussian_filter1d(translation, _SMOOTHING_S * frame_rate, axis=0, mode="nearest")

@@ -1,4 +1,4 @@
-"""Which joint of a tree is which part of a human body, by the names that programs give to joints."""
+"""Find the joints of a tree that are parts of a human body, by the joint names of common programs."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 __all__ = ["BodyParts", "find_body_parts", "plain_name"]
 
-# Words that programs put before every name: Mixamo, 3ds Max, MotionBuilder, Character Creator, VRoid, Rigify.
+# Prefixes of all joint names in Mixamo, 3ds Max, MotionBuilder, Character Creator, VRoid, Rigify.
 _PREFIXES = ({"mixamorig"}, {"bip"}, {"character"}, {"cc", "base"}, {"j", "bip", "c", "sec"}, {"def", "org"})
 _SUFFIXES = {"smplhf", "smplx", "jnt", "bone"}
 _SIDES = {"l": "l", "left": "l", "r": "r", "right": "r"}
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
-# Part of the body -> names without side, the surest first. What is taken by an earlier part is not there for a later one: a
-# foot is the toes' joint where there is an ankle, as in SMPL, and the ankle elsewhere; a shoulder the collar bone where
-# there is an arm.
+# Part of the body -> names without side, the most reliable first. A joint is used for one part only, the first that matches: a
+# `foot` is the joint of the toes if there is an ankle, as in SMPL, else the ankle; a `shoulder` is the collar bone if there is
+# an arm.
 _MIDDLE = {
     "pelvis": ("pelvis", "hips", "hip", "root"),
     "neck": ("neck", "neck1", "lowerneck", "neck0", "necklower"),
@@ -39,22 +39,22 @@ _SIDED = {
         for number in (1, 2, 3)
     },
 }
-# SMPL's hand joints lie at the knuckles, where the middle finger begins.
+# SMPL's hand joints are at the knuckles, where the middle finger begins.
 _HAND = ("hand", "fingerbase", "fingers", "middle1", "handmiddle1", "index1", "handindex1", "finger1")
 
 
 @dataclass(frozen=True)
 class BodyParts:
-    """The joints of a tree that are known parts of a human body."""
+    """Joints of a tree that were recognised as parts of a human body."""
 
     joints: dict[str, int]
-    """SMPL's name of the part, such as `l_knee` or `l_index1`, to the joint's number; the spine is not among them."""
+    """Index of the joint by SMPL's name of the part, such as `l_knee` or `l_index1`; without the spine."""
     spine: tuple[int, ...]
-    """Joints between pelvis and neck, from below, however many there are."""
+    """Indices of the joints between pelvis and neck, from bottom to top."""
 
 
 def plain_name(name: str) -> str:
-    """Return a joint's name in one spelling: `LeftUpLeg`, `mixamorig:LeftUpLeg` and `up_leg.L` all are `l_upleg`."""
+    """Return the name of a joint in a common spelling: `LeftUpLeg`, `mixamorig:LeftUpLeg` and `up_leg.L` become `l_upleg`."""
     words = [word.lower() for word in _WORD.findall(re.split(r"[:|]", name)[-1])]
     words = [str(int(word)) if word.isdecimal() and len(word) < 9 else word for word in words]
     words = _without_prefix(words)
@@ -93,7 +93,7 @@ def find_body_parts(names: Sequence[str], parents: Sequence[int]) -> BodyParts:
         parents: J parents, -1 for a root; a parent comes before its children.
 
     Returns:
-        The parts that are there; names that are not understood are left out.
+        The recognised parts; joints with other names are left out.
     """
     numbers: dict[str, int] = {}
     for joint, name in enumerate(names):
@@ -121,7 +121,7 @@ def find_body_parts(names: Sequence[str], parents: Sequence[int]) -> BodyParts:
 
 
 def _spine(found: dict[str, int], parents: Sequence[int]) -> tuple[int, ...]:
-    """Return the joints above the pelvis and below the neck, or below whatever else the trunk ends in."""
+    """Return the joints between the pelvis and the neck, or the head, collar or shoulder if there is no neck."""
     if "pelvis" not in found:
         return ()
     tops = [found[name] for name in ("neck", "head", "l_collar", "l_shoulder") if name in found]
@@ -132,7 +132,7 @@ def _spine(found: dict[str, int], parents: Sequence[int]) -> tuple[int, ...]:
     while joint >= 0 and joint != found["pelvis"]:
         chain.append(joint)
         joint = parents[joint]
-    if joint < 0:  # the pelvis hangs beside the spine, as a child of something above both
+    if joint < 0:  # the pelvis is beside the spine, as another child of a common ancestor
         above = _ancestors(found["pelvis"], parents)
         chain = [joint for joint in chain if joint not in above]
     return tuple(joint for joint in reversed(chain) if joint not in found.values())

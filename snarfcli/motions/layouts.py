@@ -1,4 +1,4 @@
-"""The joints of SMPL, SMPL-H and SMPL-X, and poses carried over from one to another."""
+"""The joint layouts of SMPL, SMPL-H and SMPL-X, and conversion of poses between them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from snarfcli.motions.joint_names import plain_name
 __all__ = ["BODY_JOINTS", "FINGER_JOINTS", "HANDS", "LAYOUTS", "SMPL", "SMPL_H", "SMPL_X", "carry_over", "layout_of"]
 
 BODY_JOINTS = SMPL_JOINT_NAMES[:22]
-"""What the three have in common, in this order."""
+"""The joints that all three layouts begin with."""
 FINGER_JOINTS = tuple(
     f"{side}_{finger}{number}"
     for side in "lr"
@@ -24,17 +24,18 @@ SMPL = SMPL_JOINT_NAMES
 SMPL_H = BODY_JOINTS + FINGER_JOINTS
 SMPL_X = (*BODY_JOINTS, "jaw", "l_eye", "r_eye", *FINGER_JOINTS)
 LAYOUTS = {len(layout): layout for layout in (SMPL, SMPL_H, SMPL_X)}
-"""Number of joints to their names."""
+"""Joint names by number of joints."""
 HANDS = ("rest", "released")
-"""What SMPL's two hand joints do where a file has fingers in their place."""
-# The released training code took the first 72 values of SMPL-H's 156 for SMPL's: two joints of the left index finger.
+"""Choices for the pose of SMPL's two hand joints if a file has fingers instead."""
+# The released training code used the first 72 of SMPL-H's 156 values for SMPL, so two joints of the left index finger for
+# hands.
 _RELEASED_HANDS = {"l_hand": "l_index1", "r_hand": "l_index2"}
 
 
 def layout_of(skeleton: Skeleton) -> tuple[str, ...] | None:
-    """Return the joints' names in order if the skeleton is SMPL's, SMPL-H's or SMPL-X's, else None.
+    """Return the joint names in order if the skeleton is that of SMPL, SMPL-H or SMPL-X, else None.
 
-    Names count, in any spelling; a skeleton without names (`joint_0` and so on) is known by the number of its joints.
+    Names are compared in any spelling; a skeleton without names (`joint_0` etc.) is recognised by its number of joints.
     """
     layout = LAYOUTS.get(skeleton.num_joints)
     is_nameless = all(re.fullmatch(r"joint_\d+", name) for name in skeleton.names)
@@ -44,9 +45,9 @@ def layout_of(skeleton: Skeleton) -> tuple[str, ...] | None:
 
 
 def carry_over(poses: NDArray[np.float64], names: tuple[str, ...], wanted: tuple[str, ...], hands: str) -> NDArray[np.float64]:
-    """Return poses [T, J, 3] of the joints `wanted` from poses [T, K, 3] of the joints `names`.
+    """Convert poses [T, K, 3] of the joints `names` to poses [T, J, 3] of the joints `wanted`.
 
-    Joints that both have keep their values; others stay straight, but for SMPL's hands with `hands="released"`.
+    Joints in both keep their values; others are zero, except SMPL's hands with `hands="released"`.
     """
     values = np.zeros((len(poses), len(wanted), 3))
     for joint, name in enumerate(wanted):

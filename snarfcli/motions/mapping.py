@@ -1,4 +1,4 @@
-"""Which joint of a file moves which joint of a skeleton."""
+"""Map the joints of a skeleton to the joints of a file that move them."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from snarfcli.motions.joint_names import BodyParts, find_body_parts, plain_name
 __all__ = ["map_joints"]
 
 _REQUIRED = ("pelvis", "l_hip", "r_hip", "l_knee", "r_knee", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow")
-_MOST_LETTERS = 280  # of the names in a message
+_MAX_LETTERS = 280  # of the names in a message
 
 
 def map_joints(
     skeleton: Skeleton, rig: Rig, path: Path, mapping: str | Path | Mapping[str, str | None] | None = None
 ) -> dict[int, int]:
-    """Return which joint of the rig moves which joint of the skeleton, by number; joints without one are left out.
+    """Return the index of the rig's joint that moves each joint of the skeleton; joints without one are left out.
 
-    If the rig has every name of the skeleton, names decide. Otherwise joints are paired as parts of a human body, the joints of
-    the spine from both ends, and what is left by name. `mapping` overrules both.
+    If the rig has every name of the skeleton, joints are paired by name. Otherwise they are paired as parts of a human body,
+    the joints of the spine from both ends, and the remaining joints by name. `mapping` overrides both.
 
     Args:
         skeleton: the target.
         rig: the source.
-        path: its file, for messages.
-        mapping: {joint of the skeleton: joint of the file, or None to leave it straight}, or a JSON file of that.
+        path: file of the rig, for messages.
+        mapping: {joint of the skeleton: joint of the file, or None to keep it at rest}, or the path of such a JSON file.
 
     Raises:
-        UserError: too few joints are understood, or the mapping names a joint that is not there.
+        UserError: too few joints are recognised, or the mapping names a joint that does not exist.
     """
     exact = {name: joint for joint, name in enumerate(rig.names)}
     sources = _Names(rig.names)
@@ -57,7 +57,7 @@ def map_joints(
 
 
 def _check_pairs(pairs: dict[int, int], target: BodyParts, source: BodyParts, skeleton: Skeleton, rig: Rig, path: Path) -> None:
-    """Refuse a file of which too little is understood: parts of a human body, or half the joints of another skeleton."""
+    """Raise UserError if required parts of a human body, or half the joints of another skeleton, have no counterpart."""
     missing = [part for part in _REQUIRED if part in target.joints and part not in source.joints]
     is_human = all(part in target.joints for part in _REQUIRED)
     if missing:
@@ -73,7 +73,7 @@ def _check_pairs(pairs: dict[int, int], target: BodyParts, source: BodyParts, sk
 
 
 class _Names:
-    """Joints by name: as written, or else in any spelling that only one of them has."""
+    """Joint indices by exact name, or by common spelling if that is unique."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.exact = {name: joint for joint, name in enumerate(names)}
@@ -88,7 +88,7 @@ class _Names:
 def _pair_parts(target: BodyParts, source: BodyParts) -> dict[int, int]:
     pairs = {joint: source.joints[part] for part, joint in target.joints.items() if part in source.joints}
     few, many = sorted((target.spine, source.spine), key=len)
-    # The ends of the spine carry hips and shoulders; those between are shared out evenly.
+    # The ends of the spine carry hips and shoulders; the joints between are paired evenly.
     last = len(many) - 1
     picks = [round(number * last / (len(few) - 1)) for number in range(len(few))] if len(few) > 1 else [0] * len(few)
     for number, pick in enumerate(picks):
@@ -100,18 +100,17 @@ def _pair_parts(target: BodyParts, source: BodyParts) -> dict[int, int]:
 def _overrule(
     pairs: dict[int, int], mapping: str | Path | Mapping[str, str | None], skeleton: Skeleton, rig: Rig, path: Path
 ) -> None:
-    """Put the user's pairs in place of those found."""
-    where = "mapping"
-    if not isinstance(mapping, Mapping):
-        where = f"mapping {mapping}"
-        mapping = read_json(mapping, "mapping")
-    is_good = isinstance(mapping, Mapping) and all(
-        isinstance(key, str) and (value is None or isinstance(value, str)) for key, value in mapping.items()
+    """Replace pairs by those of the user's mapping."""
+    where, content = "mapping", mapping
+    if isinstance(mapping, (str, Path)):
+        where, content = f"mapping {mapping}", read_json(mapping, "mapping")
+    is_good = isinstance(content, Mapping) and all(
+        isinstance(key, str) and (value is None or isinstance(value, str)) for key, value in content.items()
     )
-    if not is_good:
-        raise UserError(f'{where} must be {{"joint of the skeleton": "joint of the file" or null, ...}}')
+    if not isinstance(content, Mapping) or not is_good:
+        raise UserError(f'{where}: wanted {{"joint of the skeleton": "joint of the file" or null, ...}}, got something else')
     targets, sources = _Names(skeleton.names), _Names(rig.names)
-    for target_name, source_name in mapping.items():
+    for target_name, source_name in content.items():
         target = targets.find(target_name)
         if target is None:
             raise UserError(
@@ -131,11 +130,11 @@ def _overrule(
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names for a message, some of many, whatever characters they hold."""
+    """Return names for a message, printable and at most about `_MAX_LETTERS` letters."""
     shown: list[str] = []
     for name in names:
         name = name[:40] if name.isprintable() else ascii(name[:40])[1:-1]
-        if sum(map(len, shown)) + len(name) > _MOST_LETTERS:
+        if sum(map(len, shown)) + len(name) > _MAX_LETTERS:
             return ", ".join(shown) + f" and {len(names) - len(shown)} more"
         shown.append(name)
     return ", ".join(shown)

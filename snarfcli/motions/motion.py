@@ -16,13 +16,13 @@ class Motion:
     """Poses of one skeleton over time, in a world with y up."""
 
     name: str
-    """What the sequence is called in tables and file names."""
+    """Name of the sequence in tables and file names."""
     poses: NDArray[np.float64]
-    """[T, J, 3] axis-angle of each joint relative to its parent, radians; joint 0 is the global orientation."""
+    """[T, J, 3], axis-angle of each joint relative to its parent, radians; joint 0 is the global orientation."""
     translation: NDArray[np.float64]
-    """[T, 3] metres; the root joint stands at its rest position plus this."""
+    """[T, 3], offset of the root joint from its rest position, metres."""
     frame_rate: float
-    """Frames a second."""
+    """Frames per second."""
 
     def __post_init__(self) -> None:
         if self.poses.ndim != 3 or self.poses.shape[2] != 3 or len(self.poses) == 0:
@@ -38,7 +38,7 @@ class Motion:
         return len(self.poses)
 
     def slice(self, start: int | None = None, stop: int | None = None, step: int = 1) -> Motion:
-        """Return the frames `start:stop:step`, with Python's rules for open ends and negative numbers.
+        """Return the frames `start:stop:step`; open ends and negative numbers as in Python.
 
         Raises:
             ValueError: step is not positive, or no frame is left.
@@ -51,7 +51,7 @@ class Motion:
         return replace(self, poses=self.poses[frames], translation=self.translation[frames], frame_rate=self.frame_rate / step)
 
     def resampled(self, frame_rate: float) -> Motion:
-        """Return the motion at another frame rate: rotations by slerp, translation linearly, same start and pace."""
+        """Return the motion at another frame rate: rotations by slerp, translation linearly, same start and speed."""
         if not frame_rate > 0:
             raise ValueError(f"frame_rate: wanted a positive number, got {frame_rate}")
         if self.num_frames == 1:

@@ -1,4 +1,4 @@
-"""One reader for all files of motion."""
+"""Read motion files of all supported formats."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, legs_apart_pose
 from snarfcli.errors import UserError
 from snarfcli.files import read_npy, read_npz
 from snarfcli.formats.bvh import read_bvh
+from snarfcli.formats.gltf import read_gltf
 from snarfcli.formats.pickles import read_pickle
 from snarfcli.formats.rig import Rig
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS
@@ -28,8 +29,8 @@ __all__ = ["MOTION_SUFFIXES", "read_motion"]
 _ARRAY_SUFFIXES = (".npz", ".npy", ".pkl", ".pickle")
 _RIG_SUFFIXES = (".bvh", ".glb", ".gltf")
 MOTION_SUFFIXES = (*_ARRAY_SUFFIXES, *_RIG_SUFFIXES)
-"""Endings of the files that are read, in lower case."""
-_MOST_FILES = 100_000  # of a folder with one pose each: half an hour at 60 frames a second
+"""Suffixes of supported files, in lower case."""
+_MAX_FILES = 100_000  # in a folder with one pose per file: half an hour at 60 frames per second
 
 
 def read_motion(
@@ -41,36 +42,36 @@ def read_motion(
     mapping: str | Path | Mapping[str, str | None] | None = None,
     clip: str | int | None = None,
 ) -> Motion:
-    """Read a motion as poses of one skeleton, whatever kind of file it comes from.
+    """Read a motion as poses of one skeleton from a file of any supported format.
 
     | file | content |
     |---|---|
     | `.npz` | AMASS, old and new (SMPL-H, SMPL-X), or plain arrays `poses` or `pose` |
     | `.npy` | poses, one array |
     | `.pkl` | AIST++; nothing in it is executed |
-    | folder | one `.npz` a frame with `pose` and perhaps `trans` or `transl`, as of CAPE and the papers' demo; 1, 2, 10 |
-    | `.bvh`, `.glb`, `.gltf` | joints of any program, by their names |
+    | folder | one `.npz` per frame with `pose` and optionally `trans` or `transl`, as in CAPE and the papers' demo; 1, 2, 10 |
+    | `.bvh`, `.glb`, `.gltf` | joints of any program, recognised by name |
 
     Args:
         path: file or folder.
-        skeleton: whose poses are wanted; SMPL's 24 joints by default. Arrays are carried over between SMPL, SMPL-H and SMPL-X
-            joint by joint: hands and face where both have them, straight otherwise. A skeleton of another kind takes 3 values a
-            joint as they are. Poses of rigs are retargeted: bone directions and the height of the hips decide.
-        up: which way is up in the file. `auto`: what arrays say by `up` ("y" or "z"), else z for AMASS's, y for AIST++, y for
-            other arrays without a translation, and the axis along which the body stands for those with one and for rigs. A glTF
-            file of the skeleton itself has y up, as the format says.
-        hands: what SMPL's two hand joints do where an array has fingers in their place: `rest`, straight, or `released`,
-            values 66 to 72, as in the training data of the released code.
-        mapping: for rigs, which joint of the file moves which of the skeleton: {target: source}, or a JSON file of that. What
-            it does not name is found by name; null leaves a joint straight.
-        clip: for rigs, the name or number of the clip; the first by default.
+        skeleton: skeleton of the poses to return; SMPL's 24 joints by default. Arrays are converted between SMPL, SMPL-H and
+            SMPL-X joint by joint: hands and face are kept if both have them, else zero. For another kind of skeleton, an array
+            has 3 values per joint. Poses of rigs are retargeted by bone directions and the height of the hips.
+        up: up axis of the file. `auto`: for arrays, the array `up` ("y" or "z") if present; else z for AMASS, y for AIST++, y
+            for other arrays without a translation. Otherwise, and for rigs, the axis along which the body stands. A glTF file
+            of the skeleton itself has y up, as the format requires.
+        hands: pose of SMPL's two hand joints if an array has fingers instead: `rest`, zero; or `released`, values 66 to 72, as
+            in the training data of the released code.
+        mapping: for rigs, the joint of the file that moves each joint of the skeleton: {target: source}, or the path of such a
+            JSON file. Other joints are mapped by name; null keeps a joint at rest.
+        clip: for rigs, name or index of the clip; the first by default.
 
     Returns:
-        The motion in a world with y up, facing as in the file, named after it.
+        The motion in a world with y up, facing as in the file, named after the file.
 
     Raises:
-        UserError: the file is missing, of another kind, damaged, or does not fit the skeleton; the message says how.
-        ValueError: `up` or `hands` is none of the choices.
+        UserError: the file is missing, of another kind, damaged, or does not fit the skeleton; the message says why.
+        ValueError: `up` or `hands` is unknown.
     """
     if up not in UPS:
         raise ValueError(f"up: wanted 'auto', 'y' or 'z', got {up!r}")
@@ -86,7 +87,9 @@ def read_motion(
         return retarget(rig, chosen, skeleton, path=path, name=name, up=up, mapping=mapping)
     for setting, value in (("mapping", mapping), ("clip", clip)):
         if value is not None:
-            raise UserError(f"{setting} is for {', '.join(_RIG_SUFFIXES)} files, got pose file {path}; leave it out")
+            raise UserError(
+                f"{setting}: wanted a file ending in {', '.join(_RIG_SUFFIXES)}, got pose file {path}; leave it out"
+            )
     arrays = _read_arrays(path, suffix)
     name = path.name if path.is_dir() else path.stem
     return motion_from_arrays(arrays, skeleton, path, name=name, up=up, hands=hands)
@@ -98,15 +101,11 @@ def _smpl_skeleton() -> Skeleton:
 
 
 def _read_rig(path: Path, suffix: str) -> Rig:
-    if suffix == ".bvh":
-        return read_bvh(path)
-    from snarfcli.formats.gltf import read_gltf
-
-    return read_gltf(path)
+    return read_bvh(path) if suffix == ".bvh" else read_gltf(path)
 
 
 def _read_arrays(path: Path, suffix: str) -> dict[str, NDArray]:
-    """Return the arrays of a file or folder, by the names of AMASS and AIST++."""
+    """Return the arrays of a file or folder, with the names of AMASS and AIST++."""
     if path.is_dir():
         return _read_folder(path)
     if suffix == ".npz":
@@ -117,48 +116,48 @@ def _read_arrays(path: Path, suffix: str) -> dict[str, NDArray]:
         return _from_pickle(path)
     if not path.exists():
         raise UserError(f"no pose file at {path}")
-    raise UserError(f"pose file {path} is of no kind that is read: {', '.join(MOTION_SUFFIXES)}, or a folder of .npz files")
+    wanted = f"a file ending in {', '.join(MOTION_SUFFIXES)}, or a folder of .npz files"
+    raise UserError(f"pose file {path}: wanted {wanted}; convert it")
 
 
 def _from_pickle(path: Path) -> dict[str, NDArray]:
     content = read_pickle(path, "pose file")
     if not isinstance(content, dict):
-        raise UserError(f"pose file {path} holds {type(content).__name__}, wanted a dict with smpl_poses, as AIST++ has it")
+        raise UserError(f"pose file {path}: wanted a dict with smpl_poses, as in AIST++, got {type(content).__name__}")
     arrays = {}
     for key in POSE_KEYS:
-        value = content.get(key) if key not in ("gender", "up") else None  # text, as it should be
+        value = content.get(key) if key not in ("gender", "up") else None  # these are text
         if isinstance(value, (np.ndarray, int, float)):
             arrays[key] = np.asarray(value)
         elif value is not None:
-            raise UserError(f"pose file {path}: {key} holds {type(value).__name__}, wanted an array")
+            raise UserError(f"pose file {path}: {key}: wanted an array, got {type(value).__name__}; repair the file")
     return arrays
 
 
 def _read_folder(path: Path) -> dict[str, NDArray]:
-    """Return the poses of a folder with one file a frame, in the order in which people count."""
+    """Return the poses of a folder with one file per frame, sorted by the numbers in the file names."""
     try:
         files = [file for file in path.iterdir() if file.suffix.lower() == ".npz" and not file.name.startswith(".")]
     except OSError as error:
         raise UserError(f"folder {path} cannot be read ({error.strerror or error})") from None
     if not files:
-        raise UserError(f"folder {path} holds no .npz files; give a pose file, or a folder with one for each frame")
-    if len(files) > _MOST_FILES:
-        raise UserError(f"folder {path} holds {len(files)} .npz files, more than {_MOST_FILES}; give a part of them")
+        raise UserError(f"folder {path} has no .npz files; give a pose file, or a folder with one per frame")
+    if len(files) > _MAX_FILES:
+        raise UserError(f"folder {path}: wanted at most {_MAX_FILES} .npz files, got {len(files)}; give a part of them")
     files.sort(key=_natural)
     frames = [_read_frame(file) for file in files]
     arrays: dict[str, NDArray] = {}
     for key in dict.fromkeys(key for frame in frames for key in frame):
-        rows = [frame.get(key) for frame in frames]
-        first = next(row for row in rows if row is not None)
-        for file, row in zip(files, rows, strict=True):
-            if row is None or row.shape != first.shape:
+        first = next(frame[key] for frame in frames if key in frame)
+        for file, frame in zip(files, frames, strict=True):
+            if key not in frame or frame[key].shape != first.shape:
                 raise UserError(f"pose file {file}: {key} is missing or has another shape than in other files; repair it")
-        arrays[key] = np.stack(rows) if key in ("pose", "trans") else first
+        arrays[key] = np.stack([frame[key] for frame in frames]) if key in ("pose", "trans") else first
     return arrays
 
 
 def _read_frame(file: Path) -> dict[str, NDArray]:
-    """Return `pose` [values] and, if they are there, `trans` [3] and a frame rate of one file."""
+    """Return `pose` [values] of one file and, if present, `trans` [3] and a frame rate."""
     arrays = read_npz(file, "pose file", only=POSE_KEYS, max_bytes=MAX_POSE_BYTES)
     frame = {}
     for name, keys in (("pose", ("pose", "poses")), ("trans", ("trans", "transl"))):
@@ -167,16 +166,16 @@ def _read_frame(file: Path) -> dict[str, NDArray]:
             continue
         array = arrays[key]
         if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-            raise UserError(f"pose file {file}: {key} must hold finite numbers; repair or remove the file")
+            raise UserError(f"pose file {file}: {key}: wanted finite numbers, got others; repair or remove the file")
         if name == "pose" and (array.size > 3 * 1000 or (array.ndim > 1 and array.shape[0] > 1 and array.shape[1] != 3)):
-            raise UserError(f"pose file {file} holds more than one pose; name a file, or give a folder with a pose in each")
+            raise UserError(f"pose file {file}: wanted one pose, got more; name a file, or a folder with one pose per file")
         frame[name] = array.ravel()
     if "pose" not in frame:
-        raise UserError(f"pose file {file} has no 'pose'; every .npz file of the folder must hold one")
+        raise UserError(f"pose file {file} has no 'pose'; add it to every .npz file of the folder")
     return frame | {key: arrays[key] for key in ("mocap_framerate", "mocap_frame_rate", "frame_rate", "fps") if key in arrays}
 
 
 def _natural(file: Path) -> list[tuple[int, int, str]]:
-    """Order 1, 2, 10 as people do."""
+    """Return a sort key that compares numbers in names by value."""
     parts = re.split(r"([0-9]+)", file.name)
     return [(1, int(part), part) if at % 2 else (0, 0, part) for at, part in enumerate(parts)]

@@ -1,4 +1,4 @@
-"""Two rest poses side by side: how a skeleton is to be turned, bone by bone, to rest as a rig does."""
+"""Compare two rest poses: find the rotations that bring the joints of a skeleton to the rest pose of a rig."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ __all__ = ["RestMatch", "rest_turns"]
 
 Array = NDArray[np.float64]
 
-# In the trunk and the feet, bones of two skeletons differ by this much because people draw them differently (SMPL's neck
-# leans 30 degrees forward), not because the rest poses differ: the flesh around them is upright in both.
-_DRAWN_DIFFERENTLY_RAD = np.radians(35)
+# In the trunk and the feet, bone directions of two skeletons may differ by this much although the rest poses are the same,
+# because joints are placed differently (SMPL's neck leans 30 degrees forward).
+_PLACEMENT_RAD = np.radians(35)
 _TRUNK = ("pelvis", "neck", "head", "jaw", "l_collar", "r_collar", "l_ankle", "r_ankle", "l_foot", "r_foot")
-# A body at rest that stands this close to an axis stands along it.
+# A body at rest within this angle of an axis counts as standing along it.
 _UPRIGHT_RAD = np.radians(30)
 
 
 @dataclass(frozen=True)
 class RestMatch:
-    """Joints of a skeleton and of a rig that belong together, both at rest."""
+    """The paired joints of a skeleton (target) and a rig (source), both at rest."""
 
     pairs: dict[int, int]
-    """Joint of the skeleton to joint of the rig."""
+    """Per paired joint of the skeleton, the joint of the rig."""
     parts: dict[str, int]
-    """Parts of a human body to joints of the skeleton; none for other skeletons."""
+    """Per part of a human body, the joint of the skeleton; empty for other skeletons."""
     spine: tuple[int, ...]
     """Joints of the skeleton's spine."""
     target: Array
-    """[J, 3] joints of the skeleton, metres."""
+    """[J, 3], joints of the skeleton, metres."""
     source: Array
-    """[K, 3] joints of the rig, its units."""
+    """[K, 3], joints of the rig, units of the rig."""
     target_parents: Sequence[int]
     source_parents: Sequence[int]
     above: dict[int, int] = field(init=False)
-    """Paired joint of the skeleton to the next paired one above it; roots are left out."""
+    """Per paired joint of the skeleton, its nearest paired ancestor; without roots."""
     below: dict[int, list[int]] = field(init=False)
-    """Paired joint of the skeleton to the next paired ones below it."""
+    """Per paired joint of the skeleton, its nearest paired descendants."""
 
     def __post_init__(self) -> None:
         above: dict[int, int] = {}
@@ -59,23 +59,24 @@ class RestMatch:
         object.__setattr__(self, "below", below)
 
     def both(self, part: str) -> tuple[Array, Array] | None:
-        """Return where a part of the body is in skeleton and rig; None if one lacks it."""
+        """Return the positions [3] of a body part in the skeleton and in the rig; None if one of them lacks it."""
         joint = self.parts.get(part)
         return (self.target[joint], self.source[self.pairs[joint]]) if joint in self.pairs else None
 
 
 def rest_turns(match: RestMatch) -> dict[int, Array]:
-    """Return for each paired joint of the skeleton the rotation [3, 3] from its own rest pose to the rig's.
+    """Return the rotation [3, 3] per paired joint of the skeleton from its rest pose to that of the rig.
 
-    First as a whole, which makes up for rigs that face another way or lie at rest, then bone by bone by the smallest turn that
-    makes the bone point as the rig's. Trunk, head and feet are turned as a whole only, unless far apart.
+    First the whole skeleton is aligned, for rigs that face another way or lie at rest. Then each bone gets the smallest
+    rotation to the direction of the rig's bone. Trunk, head and feet are aligned as a whole only, unless they differ by a large
+    angle.
     """
     trunk = {*(match.parts[name] for name in _TRUNK if name in match.parts), *match.spine}
     whole = _alignment(match)
     turns: dict[int, Array] = {}
     for joint in match.pairs:
         is_trunk = joint in trunk
-        # A hand goes on as the forearm does; feet and head are upright however the leg or neck below them is drawn.
+        # A hand continues the forearm; feet and head are upright independent of the direction of leg or neck.
         start = whole if is_trunk or joint not in match.above else turns[match.above[joint]]
         turns[joint] = start
         directions = _directions(match, joint)
@@ -83,15 +84,15 @@ def rest_turns(match: RestMatch) -> dict[int, Array]:
             continue
         before, after = start @ directions[0], directions[1]
         angle = np.arctan2(np.linalg.norm(np.cross(before, after)), before @ after)
-        if angle > (_DRAWN_DIFFERENTLY_RAD if is_trunk or not match.below[joint] else 0):
+        if angle > (_PLACEMENT_RAD if is_trunk or not match.below[joint] else 0):
             turns[joint] = _smallest_turn(before, after) @ start
     return turns
 
 
 def _directions(match: RestMatch, joint: int) -> tuple[Array, Array] | None:
-    """Return where the bone of a joint points at rest, in the skeleton and in the rig, as unit vectors; None if it has none.
+    """Return the directions of the bone of a joint at rest, in skeleton and rig, as unit vectors [3]; None if there is none.
 
-    It points to the paired joints below it, to their middle if there are several, else to whatever is below in both.
+    A bone points to the mean of the paired joints below it; without any, to the only child in both trees.
     """
     below = match.below[joint]
     here, there = match.target[joint], match.source[match.pairs[joint]]
@@ -106,7 +107,7 @@ def _directions(match: RestMatch, joint: int) -> tuple[Array, Array] | None:
     for points, origin in zip(ends, (here, there), strict=True):
         offsets = points - origin
         mean, longest = offsets.mean(0), np.linalg.norm(offsets, axis=1).max()
-        # Opposite bones, as of the hips, point nowhere together.
+        # Opposite bones, as those of the hips, have no common direction.
         if not np.isfinite(longest) or np.linalg.norm(mean) <= 0.3 * longest:
             return None
         directions.append(mean / np.linalg.norm(mean))
@@ -114,20 +115,20 @@ def _directions(match: RestMatch, joint: int) -> tuple[Array, Array] | None:
 
 
 def _smallest_turn(before: Array, after: Array) -> Array:
-    """Return the smallest rotation matrix that takes one unit vector to another."""
+    """Return the matrix [3, 3] of the smallest rotation from one unit vector to another."""
     cross = np.cross(before, after)
     sine, cosine = np.linalg.norm(cross), before @ after
     if sine < 1e-12:
         if cosine > 0:
             return np.eye(3)
-        cross = np.cross(before, np.eye(3)[np.argmin(np.abs(before))])  # any axis across will do
+        cross = np.cross(before, np.eye(3)[np.argmin(np.abs(before))])  # any perpendicular axis
         sine = np.linalg.norm(cross)
         return Rotation.from_rotvec(np.pi * cross / sine).as_matrix()
     return Rotation.from_rotvec(np.arctan2(sine, cosine) * cross / sine).as_matrix()
 
 
 def _alignment(match: RestMatch) -> Array:
-    """Return the rotation that best takes the skeleton at rest as a whole to the rig at rest."""
+    """Return the rotation [3, 3] that best aligns the whole skeleton at rest with the rig at rest."""
     frames = [_body_frame(match, side) for side in (0, 1)]
     if frames[0] is not None and frames[1] is not None:
         return frames[1] @ frames[0].T
@@ -141,7 +142,12 @@ def _alignment(match: RestMatch) -> Array:
 
 
 def _body_frame(match: RestMatch, side: int) -> Array | None:
-    """Return left, up and forward of the body at rest as columns [3, 3], of the skeleton (0) or the rig (1)."""
+    """Return the directions left, up and forward of the body at rest as columns [3, 3]; None if unknown.
+
+    Args:
+        match: the paired joints.
+        side: 0 for the skeleton, 1 for the rig.
+    """
     points = {part: both[side] for part in match.parts if (both := match.both(part)) is not None}
     sides = [(f"l_{part}", f"r_{part}") for part in ("hip", "shoulder")]
     pairs = [(points[left], points[right]) for left, right in sides if left in points and right in points]
@@ -154,7 +160,7 @@ def _body_frame(match: RestMatch, side: int) -> Array | None:
         left = sum((a - b) / np.linalg.norm(a - b) for a, b in pairs)
         up = tops[0] - (points["l_hip"] + points["r_hip"]) / 2
         up = up / np.linalg.norm(up)
-        # How a neck is drawn must not tilt the whole body.
+        # The direction of the neck must not tilt the whole body.
         axis = np.zeros(3)
         axis[np.argmax(np.abs(up))] = np.sign(up[np.argmax(np.abs(up))])
         up = axis if up @ axis > np.cos(_UPRIGHT_RAD) else up

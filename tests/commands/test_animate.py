@@ -202,7 +202,7 @@ def test_truth_is_shown_where_there_is_some(config, toy, tmp_path, monkeypatch):
         run(replace(config, beside=["truth"]))
     solid = trimesh.creation.box((0.4, 0.2, 0.2))
     meshes = [(np.add(solid.vertices, (2 * frame, 1, 0)), solid.faces) for frame in range(6)]
-    monkeypatch.setattr(animate, "true_meshes", lambda *arguments: meshes)
+    monkeypatch.setattr(animate, "ground_truth_meshes", lambda *arguments: meshes)
     assert run(replace(config, beside=["truth"], max_frames=2, output=str(tmp_path / "out"))) == 0
     _, frames = video_frames(tmp_path / "out" / "video.mp4")
     is_clay = [frame[:64, 65:].astype(int) @ (1, 0, -1) > 30 for frame in frames]
@@ -348,7 +348,7 @@ def test_what_a_user_can_get_wrong(config, change, message):
 
 def test_a_motion_of_another_skeleton_is_refused(config, tmp_path):
     np.savez(tmp_path / "smpl.npz", poses=np.zeros((2, 72)), trans=np.zeros((2, 3)))
-    with pytest.raises(UserError, match="has 72 values a frame, wanted 6"):
+    with pytest.raises(UserError, match="wanted 6 values per frame, got 72"):
         run(replace(config, pose=str(tmp_path / "smpl.npz")))
 
 

@@ -38,12 +38,12 @@ def test_sequences_and_rows(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"gender": "male"}, "has no 'betas'; give shape.npz or a sequence"),
-        ({"betas": BETAS, "gender": "man\n"}, "gender is 'man', wanted male, female or neutral"),
-        ({"betas": np.full(10, np.nan)}, "betas must hold finite numbers"),
-        ({"betas": np.zeros(0)}, "betas must hold finite numbers, one or more"),
-        ({"betas": np.array("ten")}, "betas must hold finite numbers"),
-        ({"betas": np.arange(20.0).reshape(2, 10)}, "changes from row to row"),
+        ({"gender": "male"}, "wanted 'betas', got none; give shape.npz or a sequence"),
+        ({"betas": BETAS, "gender": "man\n"}, "gender: wanted male, female or neutral, got 'man'"),
+        ({"betas": np.full(10, np.nan)}, "betas: wanted at least 1 finite number"),
+        ({"betas": np.zeros(0)}, "betas: wanted at least 1 finite number"),
+        ({"betas": np.array("ten")}, "betas: wanted at least 1 finite number"),
+        ({"betas": np.arange(20.0).reshape(2, 10)}, "equal in all rows"),
         ({"betas": BETAS, "gender": np.array(None, dtype=object)}, "never executed"),
     ],
 )

@@ -90,7 +90,7 @@ def test_missing_frame_rate_is_noted(tmp_path, caplog):
     with caplog.at_level(logging.INFO, "snarfcli"):
         motion = read_motion(save(tmp_path, poses=np.zeros((2, 72))))
     assert motion.frame_rate == 60.0
-    assert "no frame rate given, 60 frames a second assumed" in caplog.text
+    assert "no frame rate given, 60 frames per second assumed" in caplog.text
 
 
 def one_absurd_value():
@@ -108,33 +108,42 @@ def nan_poses():
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"trans": np.zeros((2, 3))}, "has no 'poses'; it holds trans"),
-        ({"v": np.zeros((2, 3))}, "has no 'poses'; it holds nothing of use"),
-        ({"poses": np.degrees(amass_arrays(width=72)["poses"])}, "the poses look like degrees, up to .*save them in radians"),
-        ({"poses": np.full((3, 72), 1e300)}, "the poses look like degrees"),
-        ({"poses": one_absurd_value()}, r"the poses hold 1e\+08, which is no angle in radians"),
-        ({"poses": np.zeros((2, 24, 3, 3))}, r"poses has shape \[2, 24, 3, 3\], but does not hold rotation matrices"),
-        ({"poses": np.zeros((2, 24, 4))}, r"poses has shape \[2, 24, 4\], wanted \[frames, values\]"),
-        ({"poses": np.zeros((2, 69))}, "has 69 values a frame, wanted 72"),
-        ({"poses": np.zeros((2, 72), complex)}, "poses holds complex128, wanted numbers"),
-        ({"root_orient": np.zeros((2, 3))}, "has no 'poses'; it holds root_orient"),
-        ({"root_orient": np.zeros((2, 3)), "pose_body": np.zeros((3, 63))}, r"pose_body has shape \[3, 63\], wanted \[2, 63\]"),
-        ({"poses": np.zeros((2, 72)), "trans": np.full((2, 3), 1e9)}, "trans leads over 1000 km away; wanted metres"),
-        ({"poses": np.zeros((2, 72)), "smpl_scaling": 0.0, "trans": np.ones((2, 3))}, "smpl_scaling must be one positive"),
-        ({"poses": np.zeros((4, 71))}, r"has 71 values a frame, wanted 72 \(SMPL\), 156 \(SMPL-H\) or 165 \(SMPL-X\)"),
-        ({"poses": nan_poses()}, "poses holds NaN or infinity, first in frame 1"),
-        ({"poses": np.full((2, 72), np.inf)}, "poses holds NaN or infinity, first in frame 0"),
-        ({"poses": np.zeros((0, 72))}, "has zero frames"),
-        ({"poses": np.zeros((0, 24, 3))}, "has zero frames"),
-        ({"poses": np.zeros((2, 2, 72))}, r"poses has shape \[2, 2, 72\], wanted \[frames, values\]"),
-        ({"poses": np.array("walk")}, "poses holds <U4, wanted numbers"),
+        ({"trans": np.zeros((2, 3))}, "wanted 'poses', got trans"),
+        ({"v": np.zeros((2, 3))}, "wanted 'poses', got no pose arrays"),
+        (
+            {"poses": np.degrees(amass_arrays(width=72)["poses"])},
+            "got degrees, up to .*save them in radians",
+        ),
+        ({"poses": np.full((3, 72), 1e300)}, "wanted angles in radians, got degrees"),
+        ({"poses": one_absurd_value()}, r"wanted angles in radians, got 1e\+08"),
+        ({"poses": np.zeros((2, 24, 3, 3))}, r"poses: wanted rotation matrices, got others of shape \[2, 24, 3, 3\]"),
+        ({"poses": np.zeros((2, 24, 4))}, r"poses: wanted shape \[frames, values\], got \[2, 24, 4\]"),
+        ({"poses": np.zeros((2, 69))}, "values per frame, got 69"),
+        ({"poses": np.zeros((2, 72), complex)}, "poses: wanted numbers, got complex128"),
+        ({"root_orient": np.zeros((2, 3))}, "wanted 'poses', got root_orient"),
+        (
+            {"root_orient": np.zeros((2, 3)), "pose_body": np.zeros((3, 63))},
+            r"wanted shape \[2, 63\], got \[3, 63\]",
+        ),
+        ({"poses": np.zeros((2, 72)), "trans": np.full((2, 3), 1e9)}, "trans: wanted metres, at most 1000 km, got more"),
+        (
+            {"poses": np.zeros((2, 72)), "smpl_scaling": 0.0, "trans": np.ones((2, 3))},
+            "wanted one positive number",
+        ),
+        ({"poses": np.zeros((4, 71))}, r"wanted 72 \(SMPL\), 156 \(SMPL-H\) or 165 \(SMPL-X\) values per frame, got 71"),
+        ({"poses": nan_poses()}, "poses: wanted finite numbers, got NaN or infinity, first in frame 1"),
+        ({"poses": np.full((2, 72), np.inf)}, "poses: wanted finite numbers, got NaN or infinity, first in frame 0"),
+        ({"poses": np.zeros((0, 72))}, "wanted at least 1 frame, got 0"),
+        ({"poses": np.zeros((0, 24, 3))}, "wanted at least 1 frame, got 0"),
+        ({"poses": np.zeros((2, 2, 72))}, r"poses: wanted shape \[frames, values\], got \[2, 2, 72\]"),
+        ({"poses": np.array("walk")}, "poses: wanted numbers, got <U4"),
         ({"poses": np.array([{"a": 1}], dtype=object)}, "holds pickled objects, which are never executed"),
         ({"poses": np.zeros((2, 72)), "gender": np.array(None, dtype=object)}, "holds pickled objects"),
-        ({"poses": np.zeros((4, 72)), "trans": np.zeros((3, 3))}, r"trans has shape \[3, 3\], wanted \[4, 3\]"),
-        ({"poses": np.zeros((4, 72)), "trans": np.zeros(4)}, r"trans has shape \[1, 4\], wanted \[4, 3\]"),
-        ({"poses": np.zeros((1, 72)), "trans": np.full((1, 3), np.nan)}, "trans holds NaN or infinity"),
-        ({"poses": np.zeros((1, 72)), "mocap_framerate": np.array(0.0)}, "mocap_framerate must be one positive number"),
-        ({"poses": np.zeros((1, 72)), "mocap_frame_rate": np.array("fast")}, "mocap_frame_rate must be one positive number"),
+        ({"poses": np.zeros((4, 72)), "trans": np.zeros((3, 3))}, r"trans: wanted shape \[4, 3\], got \[3, 3\]"),
+        ({"poses": np.zeros((4, 72)), "trans": np.zeros(4)}, r"trans: wanted shape \[4, 3\], got \[1, 4\]"),
+        ({"poses": np.zeros((1, 72)), "trans": np.full((1, 3), np.nan)}, "trans: wanted finite numbers, got NaN or infinity"),
+        ({"poses": np.zeros((1, 72)), "mocap_framerate": np.array(0.0)}, "mocap_framerate: wanted one positive number"),
+        ({"poses": np.zeros((1, 72)), "mocap_frame_rate": np.array("fast")}, "mocap_frame_rate: wanted one positive number"),
     ],
 )
 def test_bad_content(tmp_path, arrays, message):
@@ -179,7 +188,7 @@ def test_a_skeleton_of_another_kind_takes_its_own_width_only(tmp_path):
     own = smpl_like([f"bone{j}" for j in range(52)])
     path = save(tmp_path, **amass_arrays())
     np.testing.assert_array_equal(read_motion(path, own, up="y").poses.reshape(4, 156), amass_arrays()["poses"])
-    with pytest.raises(UserError, match=r"has 165 values a frame, wanted 156$"):
+    with pytest.raises(UserError, match=r"wanted 156 values per frame, got 165"):
         read_motion(save(tmp_path, **amass_arrays(width=165)), own)
 
 

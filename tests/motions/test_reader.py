@@ -29,7 +29,7 @@ def test_bad_files(tmp_path):
         assert "\n" not in str(caught.value)
     with pytest.raises(UserError, match="no pose file at"):
         read_motion(tmp_path / "none.npz")
-    for name, message in (("walk.fbx", "is of no kind that is read: .npz, .npy"), ("none", "no pose file at")):
+    for name, message in (("walk.fbx", "wanted a file ending in .npz, .npy"), ("none", "no pose file at")):
         (tmp_path / "walk.fbx").touch()
         with pytest.raises(UserError, match=message):
             read_motion(tmp_path / name)
@@ -40,7 +40,7 @@ def test_wrong_arguments(tmp_path):
         read_motion(tmp_path / "a.npz", up="x")
     with pytest.raises(ValueError, match="hands: wanted 'rest' or 'released', got 'fists'"):
         read_motion(tmp_path / "a.npz", hands="fists")
-    with pytest.raises(UserError, match=r"has 72 values a frame, wanted 6$"):
+    with pytest.raises(UserError, match=r"wanted 6 values per frame, got 72"):
         read_motion(save(tmp_path, poses=np.zeros((1, 72))), TWO_JOINTS)
 
 
@@ -88,30 +88,33 @@ def test_equal_samples_through_every_route(tmp_path):
 def test_folders_that_are_no_frames(tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
-    with pytest.raises(UserError, match=r"frames holds no .npz files; give a pose file, or a folder with one for each frame"):
+    with pytest.raises(UserError, match=r"frames has no .npz files; give a pose file, or a folder with one per frame"):
         read_motion(folder)
     np.savez(folder / "a_2.npz", pose=np.zeros(72), transl=np.zeros(3))
     np.savez(folder / "a_10.npz", pose=np.zeros(72))
     with pytest.raises(UserError, match=r"a_10.npz: trans is missing or has another shape"):
         read_motion(folder)
     np.savez(folder / "a_10.npz", v_posed=np.zeros((5, 3)))
-    with pytest.raises(UserError, match=r"a_10.npz has no 'pose'; every .npz file"):
+    with pytest.raises(UserError, match=r"a_10.npz has no 'pose'; add it to every .npz file"):
         read_motion(folder)
     np.savez(folder / "a_10.npz", pose=np.full(72, np.nan))
-    with pytest.raises(UserError, match=r"a_10.npz: pose must hold finite numbers"):
+    with pytest.raises(UserError, match=r"a_10.npz: pose: wanted finite numbers"):
         read_motion(folder)
     np.savez(folder / "a_10.npz", poses=np.zeros((5, 156)))
-    with pytest.raises(UserError, match=r"a_10.npz holds more than one pose; name a file"):
+    with pytest.raises(UserError, match=r"a_10.npz: wanted one pose, got more; name a file"):
         read_motion(folder)
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ([1, 2], "holds list, wanted a dict with smpl_poses"),
-        ({"smpl_trans": np.zeros((2, 3))}, "has no 'poses'; it holds smpl_trans"),
-        ({"smpl_poses": "dance"}, "smpl_poses holds str, wanted an array"),
-        ({"smpl_poses": np.zeros((2, 72)), "smpl_trans": np.zeros((2, 3)), "smpl_scaling": -1.0}, "smpl_scaling must"),
+        ([1, 2], "wanted a dict with smpl_poses, as in AIST.., got list"),
+        ({"smpl_trans": np.zeros((2, 3))}, "wanted 'poses', got smpl_trans"),
+        ({"smpl_poses": "dance"}, "smpl_poses: wanted an array, got str"),
+        (
+            {"smpl_poses": np.zeros((2, 72)), "smpl_trans": np.zeros((2, 3)), "smpl_scaling": -1.0},
+            "wanted one positive number",
+        ),
     ],
 )
 def test_pickles_that_are_no_dances(tmp_path, content, message):
@@ -135,6 +138,6 @@ def test_a_pickle_that_runs_code_is_refused(tmp_path):
 def test_clip_and_mapping_are_for_rigs(tmp_path):
     path = save(tmp_path, **amass_arrays())
     for setting in ({"clip": 0}, {"mapping": {}}):
-        message = f"{next(iter(setting))} is for .bvh, .glb, .gltf files, got pose file .*leave it out"
+        message = f"{next(iter(setting))}: wanted a file ending in .bvh, .glb, .gltf, got pose file .*leave it out"
         with pytest.raises(UserError, match=message):
             read_motion(path, **setting)

@@ -16,12 +16,12 @@ from snarfcli.avatar import Avatar
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.animate_settings import AnimateConfig
 from snarfcli.commands.animation_folder import POSTER, RECORD, VIDEO, folder_name, frame_settings, prepare_folder
-from snarfcli.commands.ground_truth import true_meshes
+from snarfcli.commands.ground_truth import ground_truth_meshes
 from snarfcli.commands.selection import (
-    ChosenMotion,
-    check_motion_choice,
-    choose_motion,
-    load_chosen_avatar,
+    SelectedMotion,
+    check_motion_selection,
+    load_selected_avatar,
+    select_motion,
 )
 from snarfcli.errors import UserError
 from snarfcli.files import write_json
@@ -60,11 +60,13 @@ def run(config: AnimateConfig) -> int:
         UserError: there is no avatar or no motion, or a setting cannot be used.
     """
     plan = _check(config)
-    avatar, path = load_chosen_avatar(config)
+    avatar, path = load_selected_avatar(config)
     _check_system(config, avatar)
-    chosen = choose_motion(config, config, avatar.skeleton, config.pose, config.motion)
+    chosen = select_motion(config, config, avatar.skeleton, config.pose, config.motion)
     motion, count = chosen.motion, len(chosen.numbers)
-    truth = true_meshes(config, config, avatar, chosen, config.pose) if config.video and "truth" in config.beside else None
+    truth = (
+        ground_truth_meshes(config, config, avatar, chosen, config.pose) if config.video and "truth" in config.beside else None
+    )
     on_cpu = avatar.device.type == "cpu"
     processes = frame_processes(plan.processes, count, config.resolution, extract=on_cpu, draw=config.video)
     folder = Path(config.output) if config.output else path.parent / "animation" / folder_name(motion.name)
@@ -125,7 +127,7 @@ def _check(config: AnimateConfig) -> _Plan:
     """Refuse settings that cannot be used, before any work starts."""
     for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("camera", CAMERAS)):
         check_choice(name, getattr(config, name), choices)
-    check_motion_choice(config)
+    check_motion_selection(config)
     check_number("resolution", config.resolution, *_RESOLUTIONS)
     check_number("keep_share", config.keep_share, 0, 1)
     check_number("azimuth_deg", config.azimuth_deg, -360, 360)
@@ -151,7 +153,7 @@ def _screen(
     config: AnimateConfig,
     plan: _Plan,
     avatar: Avatar,
-    chosen: ChosenMotion,
+    chosen: SelectedMotion,
     canonical: Mesh | None,
     truth: GroundTruthMeshes | None,
 ) -> Screen:

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from omegaconf import MISSING
 
-from snarfcli.commands.selection import AvatarChoice, MotionChoice
+from snarfcli.commands.selection import AvatarSelection, MotionSelection
 
 __all__ = ["AnimateConfig"]
 
 
 @dataclass
-class AnimateConfig(MotionChoice, AvatarChoice):
+class AnimateConfig(MotionSelection, AvatarSelection):
     """Settings of `snarf animate`."""
 
     pose: str | None = MISSING

@@ -8,7 +8,7 @@ from typing import Any
 
 from snarfcli import names
 from snarfcli.commands.animate_settings import AnimateConfig
-from snarfcli.commands.selection import ChosenMotion
+from snarfcli.commands.selection import SelectedMotion
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 
@@ -24,7 +24,7 @@ def folder_name(name: str) -> str:
     return names.folder_name(name, "motion")
 
 
-def frame_settings(config: AnimateConfig, avatar: Path, chosen: ChosenMotion) -> dict[str, Any]:
+def frame_settings(config: AnimateConfig, avatar: Path, chosen: SelectedMotion) -> dict[str, Any]:
     """Return what the frames depend on: frames of other settings must not be mixed with them."""
     # Of the frames, only which the first one is and how far they are apart: more of the same motion can be made later.
     whole = chosen.whole

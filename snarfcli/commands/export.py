@@ -15,11 +15,11 @@ from snarfcli.avatar import Avatar
 from snarfcli.checks import check_choice
 from snarfcli.commands.selection import (
     BUILTIN_MOTIONS,
-    AvatarChoice,
-    MotionChoice,
-    check_motion_choice,
-    choose_motion,
-    load_chosen_avatar,
+    AvatarSelection,
+    MotionSelection,
+    check_motion_selection,
+    load_selected_avatar,
+    select_motion,
 )
 from snarfcli.errors import UserError
 from snarfcli.export.blender import BLENDER_FORMATS, convert, find_blender
@@ -43,7 +43,7 @@ _RECORD = "export.json"
 
 
 @dataclass
-class ExportConfig(MotionChoice, AvatarChoice):
+class ExportConfig(MotionSelection, AvatarSelection):
     """Settings of `snarf export`."""
 
     pose: list[str] | None = MISSING
@@ -91,7 +91,7 @@ def run(config: ExportConfig) -> int:
         trained_on = config.data.avatars or config.data.name
         folder = run_folder(config.output_root, trained_on, config.subject, config.run)
         _check_place(config, _place(config, folder, config.subject))
-    avatar, path = load_chosen_avatar(config)
+    avatar, path = load_selected_avatar(config)
     check_avatar(avatar)
     output = Path(config.output) if config.output else _place(config, path.parent, _subject(config, avatar))
     output = _check_place(config, output)
@@ -126,7 +126,7 @@ def _check(config: ExportConfig) -> CharacterOptions:
         weight_colors=config.weight_colors,
     )
     check_options(options)
-    check_motion_choice(config)
+    check_motion_selection(config)
     if config.format in MESH_WRITERS:
         unused = {name: getattr(config, name) for name in ("influences", "morph_targets")}
         given = [f"{name}={value}" for name, value in unused.items() if value != getattr(CharacterOptions, name)]
@@ -171,7 +171,7 @@ def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:
     wanted += [(None, motion) for motion in config.motion or ()]
     clips = []
     for pose, motion in wanted or [(None, None)]:
-        chosen = choose_motion(config, config, avatar.skeleton, pose, motion)
+        chosen = select_motion(config, config, avatar.skeleton, pose, motion)
         clip = Clip(chosen.motion, chosen.bone_transforms)
         is_builtin = pose is None and clip.bone_transforms is None and clip.motion.name in BUILTIN_MOTIONS
         if config.height == "ground" or (config.height == "auto" and is_builtin):

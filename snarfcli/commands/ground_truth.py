@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from snarfcli.avatar import Avatar
 from snarfcli.bodies import Skeleton, builtin_body
-from snarfcli.commands.selection import AvatarChoice, ChosenMotion, MotionChoice
+from snarfcli.commands.selection import AvatarSelection, MotionSelection, SelectedMotion
 from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject
 from snarfcli.datasets.clothed import ClothedBody, ClothedMeshes
 from snarfcli.datasets.posed_meshes import BodyMeshes
@@ -18,7 +18,7 @@ from snarfcli.errors import UserError
 from snarfcli.motions.layouts import SMPL, layout_of
 from snarfcli.samples.store import SampleStore, SequenceSamples
 
-__all__ = ["StoredMeshes", "true_meshes"]
+__all__ = ["StoredMeshes", "ground_truth_meshes"]
 
 _MADE_FOR = "the built-in subjects (data=builtin, data=clothed) and sequences of samples have one"
 _JOINTS_APART_M = 1e-3  # rest joints of one skeleton that was stored in float32
@@ -50,8 +50,8 @@ class StoredMeshes:
         return self._sequence.vertices(frame) + self.shifts[index].astype(np.float32), self._sequence.faces(frame)
 
 
-def true_meshes(
-    choice: AvatarChoice, motion: MotionChoice, avatar: Avatar, chosen: ChosenMotion, pose: str | None
+def ground_truth_meshes(
+    choice: AvatarSelection, motion: MotionSelection, avatar: Avatar, chosen: SelectedMotion, pose: str | None
 ) -> StoredMeshes | BodyMeshes | ClothedMeshes:
     """Return the true posed mesh of each frame of a chosen motion.
 

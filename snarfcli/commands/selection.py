@@ -23,12 +23,12 @@ from snarfcli.samples.stored_motion import stored_motion
 
 __all__ = [
     "BUILTIN_MOTIONS",
-    "AvatarChoice",
-    "ChosenMotion",
-    "MotionChoice",
-    "check_motion_choice",
-    "choose_motion",
-    "load_chosen_avatar",
+    "AvatarSelection",
+    "MotionSelection",
+    "SelectedMotion",
+    "check_motion_selection",
+    "load_selected_avatar",
+    "select_motion",
 ]
 
 _MOTION = "jumping_jacks"
@@ -38,7 +38,7 @@ _FRAME_RATES = (1.0, 1000.0)
 
 
 @dataclass
-class AvatarChoice:
+class AvatarSelection:
     """Whose avatar, and where it computes."""
 
     subject: str = MISSING
@@ -60,7 +60,7 @@ class AvatarChoice:
 
 
 @dataclass
-class MotionChoice:
+class MotionSelection:
     """How a motion is read, and which part of it is taken."""
 
     up: str = MISSING
@@ -90,7 +90,7 @@ class MotionChoice:
 
 
 @dataclass(frozen=True, eq=False)
-class ChosenMotion:
+class SelectedMotion:
     """The part of a motion that was asked for."""
 
     motion: Motion
@@ -105,7 +105,7 @@ class ChosenMotion:
     """[T, J, 4, 4] canonical to posed, metres, where joints stretch so that the poses do not say it all; else None."""
 
 
-def load_chosen_avatar(choice: AvatarChoice) -> tuple[Avatar, Path]:
+def load_selected_avatar(choice: AvatarSelection) -> tuple[Avatar, Path]:
     """Load the avatar of a choice, on its device and with its threads; return it and its file.
 
     Raises:
@@ -122,7 +122,7 @@ def load_chosen_avatar(choice: AvatarChoice) -> tuple[Avatar, Path]:
     return Avatar.load(path, device), path
 
 
-def check_motion_choice(choice: MotionChoice) -> None:
+def check_motion_selection(choice: MotionSelection) -> None:
     """Refuse, before any work starts, settings of a motion that cannot be used.
 
     Raises:
@@ -136,9 +136,9 @@ def check_motion_choice(choice: MotionChoice) -> None:
         check_number(name, getattr(choice, name), *_FRAME_RATES)
 
 
-def choose_motion(
-    choice: MotionChoice, avatar: AvatarChoice, skeleton: Skeleton, pose: str | None, motion: str | None
-) -> ChosenMotion:
+def select_motion(
+    choice: MotionSelection, avatar: AvatarSelection, skeleton: Skeleton, pose: str | None, motion: str | None
+) -> SelectedMotion:
     """Read a motion and take the part of it that was asked for: first the frames, then their rate, then their number.
 
     Args:
@@ -180,11 +180,11 @@ def choose_motion(
         if transforms is not None:
             transforms = transforms.copy()
             transforms[:, :, :3, 3] -= way[:, None].astype(np.float32)
-    return ChosenMotion(taken, whole, first, numbers, transforms)
+    return SelectedMotion(taken, whole, first, numbers, transforms)
 
 
 def _read(
-    choice: MotionChoice, avatar: AvatarChoice, skeleton: Skeleton, pose: str | None, name: str | None
+    choice: MotionSelection, avatar: AvatarSelection, skeleton: Skeleton, pose: str | None, name: str | None
 ) -> tuple[Motion, NDArray[np.float32] | None]:
     """Return the whole motion, with y up, and its bone transforms where the poses do not say it all."""
     if pose is not None:

@@ -14,7 +14,13 @@ from omegaconf import MISSING
 
 from snarfcli.avatar import Avatar
 from snarfcli.checks import check_choice, check_number
-from snarfcli.commands.selection import AvatarChoice, MotionChoice, check_motion_choice, choose_motion, load_chosen_avatar
+from snarfcli.commands.selection import (
+    AvatarSelection,
+    MotionSelection,
+    check_motion_selection,
+    load_selected_avatar,
+    select_motion,
+)
 from snarfcli.errors import UserError
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL, layout_of
@@ -31,7 +37,7 @@ _RESOLUTIONS = (16, 1024)
 
 
 @dataclass
-class ViewConfig(AvatarChoice, MotionChoice):
+class ViewConfig(AvatarSelection, MotionSelection):
     """Settings of `snarf view`."""
 
     pose: list[str] = MISSING
@@ -78,7 +84,7 @@ def start(config: ViewConfig) -> ViewServer:
     require_viser()
     port = _check(config)
     check_port(config.host, port)
-    avatar, path = load_chosen_avatar(config)
+    avatar, path = load_selected_avatar(config)
     if not avatar.has_skinning_weights and (config.weight_colors or config.surface == "skinned"):
         log.info("model %s has no skinning weights: only its field is shown", avatar.config.model.name)
     shelf = _Shelf(config, avatar)
@@ -104,7 +110,7 @@ def start(config: ViewConfig) -> ViewServer:
 
 def _check(config: ViewConfig) -> int:
     """Refuse settings that cannot be used, before any work starts; return the port, 0 for any."""
-    check_motion_choice(config)
+    check_motion_selection(config)
     check_choice("surface", config.surface, SURFACE_NAMES)
     check_number("resolution", config.resolution, *_RESOLUTIONS)
     text = config.port.strip()
@@ -127,7 +133,7 @@ class _Shelf:
         self._skeleton = avatar.skeleton
         self._loaded: dict[str, tuple[Any, Any]] = {}
         for name, path in zip(_file_names(config.pose), config.pose, strict=True):
-            chosen = choose_motion(config, config, self._skeleton, path, None)
+            chosen = select_motion(config, config, self._skeleton, path, None)
             self._loaded[name] = chosen.motion, chosen.bone_transforms
         self.names: list[str] = [*self._loaded, *_own_motions(config, avatar)]
         first = next(iter(self._loaded), config.motion)
@@ -139,7 +145,7 @@ class _Shelf:
     def load(self, name: str) -> tuple[Any, Any]:
         """Return the motion of a name, and its bone transforms where joints stretch; raises UserError."""
         if name not in self._loaded:
-            chosen = choose_motion(self._config, self._config, self._skeleton, None, name)
+            chosen = select_motion(self._config, self._config, self._skeleton, None, name)
             self._loaded[name] = chosen.motion, chosen.bone_transforms
         return self._loaded[name]
 

@@ -11,15 +11,15 @@ import pytest
 from toy_training import toy_store
 
 from snarfcli.bodies import Skeleton
-from snarfcli.commands.ground_truth import true_meshes
-from snarfcli.commands.selection import AvatarChoice, ChosenMotion, MotionChoice, choose_motion
+from snarfcli.commands.ground_truth import ground_truth_meshes
+from snarfcli.commands.selection import AvatarSelection, MotionSelection, SelectedMotion, select_motion
 from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.samples.store import SampleStore
 
-CHOICE = AvatarChoice("50004", DataConfig("builtin", 8, 1, 1), "data", "outputs", "fast_snarf", None, "cpu", None)
-PLAIN = MotionChoice("auto", "rest", None, None, 0, 30.0, 0, None, 1, None, None, False)
+CHOICE = AvatarSelection("50004", DataConfig("builtin", 8, 1, 1), "data", "outputs", "fast_snarf", None, "cpu", None)
+PLAIN = MotionSelection("auto", "rest", None, None, 0, 30.0, 0, None, 1, None, None, False)
 
 
 def avatar_of(skeleton: Skeleton, **facts: str) -> SimpleNamespace:
@@ -31,15 +31,15 @@ def subject():
     return builtin_subject("50004")
 
 
-def part(motion, numbers) -> ChosenMotion:
+def part(motion, numbers) -> SelectedMotion:
     taken = replace(motion, poses=motion.poses[numbers], translation=motion.translation[numbers])
-    return ChosenMotion(taken, motion, numbers[0], numbers)
+    return SelectedMotion(taken, motion, numbers[0], numbers)
 
 
 def test_a_built_in_body_is_known_in_every_pose(subject):
     sequence = subject.sequences[0]
     chosen = part(sequence.motion, [3, 8])
-    truth = true_meshes(CHOICE, PLAIN, avatar_of(subject.skeleton, data="builtin", subject="50004"), chosen, "any.npz")
+    truth = ground_truth_meshes(CHOICE, PLAIN, avatar_of(subject.skeleton, data="builtin", subject="50004"), chosen, "any.npz")
     for index, frame in enumerate(chosen.numbers):
         for came, wanted in zip(truth[index], sequence.meshes[frame], strict=True):
             np.testing.assert_array_equal(came, wanted)
@@ -49,11 +49,11 @@ def test_another_body_or_data_set_has_none(subject):
     chosen = part(subject.sequences[0].motion, [0])
     taller = replace(subject.skeleton, joints_rest=subject.skeleton.joints_rest * 1.1)
     with pytest.raises(UserError, match="subject 50004 has other joints than the built-in body"):
-        true_meshes(CHOICE, PLAIN, avatar_of(taller, data="builtin", subject="50004"), chosen, None)
+        ground_truth_meshes(CHOICE, PLAIN, avatar_of(taller, data="builtin", subject="50004"), chosen, None)
     other = replace(CHOICE, data=DataConfig("dfaust", 8, 1, 1))
     for pose, what in ((None, "built-in motions"), ("a.npz", "pose files")):
         with pytest.raises(UserError, match=f"no ground truth of {what} for data=dfaust; .* leave truth out"):
-            true_meshes(other, PLAIN, avatar_of(subject.skeleton, data="dfaust", subject="50004"), chosen, pose)
+            ground_truth_meshes(other, PLAIN, avatar_of(subject.skeleton, data="dfaust", subject="50004"), chosen, pose)
 
 
 def test_samples_bring_their_own(tmp_path):
@@ -64,8 +64,8 @@ def test_samples_bring_their_own(tmp_path):
     avatar = avatar_of(store.skeleton, data="meshes", subject="toy")
     sequence = store.sequences("train")[0]
     plain = replace(PLAIN, step=2, in_place=True)
-    chosen = choose_motion(plain, choice, store.skeleton, None, sequence.name)
-    truth = pickle.loads(pickle.dumps(true_meshes(choice, plain, avatar, chosen, None)))
+    chosen = select_motion(plain, choice, store.skeleton, None, sequence.name)
+    truth = pickle.loads(pickle.dumps(ground_truth_meshes(choice, plain, avatar, chosen, None)))
     assert len(truth) == len(chosen.numbers) == 3
     way = sequence.translation[chosen.numbers] * (1, 0, 1)
     for index, frame in enumerate(chosen.numbers):
@@ -73,4 +73,4 @@ def test_samples_bring_their_own(tmp_path):
         np.testing.assert_allclose(vertices + way[index], sequence.vertices(frame), atol=1e-6)
         np.testing.assert_array_equal(faces, sequence.faces(frame))
     with pytest.raises(UserError, match="no meshes between their frames; leave out frame_rate, or truth"):
-        true_meshes(choice, replace(plain, frame_rate=10.0), avatar, chosen, None)
+        ground_truth_meshes(choice, replace(plain, frame_rate=10.0), avatar, chosen, None)

@@ -9,15 +9,15 @@ import pytest
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, legs_apart_pose
 from snarfcli.commands import selection
-from snarfcli.commands.selection import AvatarChoice, MotionChoice, check_motion_choice, choose_motion
+from snarfcli.commands.selection import AvatarSelection, MotionSelection, check_motion_selection, select_motion
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.motions import Motion, read_motion
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS
 
 FRAMES, RATE = 25, 24.0
-AVATAR = AvatarChoice("50002", DataConfig("builtin", 8, 1, 1), "data", "outputs", "fast_snarf", None, "cpu", None)
-PLAIN = MotionChoice("auto", "rest", None, None, 0, 30.0, 0, None, 1, None, None, False)
+AVATAR = AvatarSelection("50002", DataConfig("builtin", 8, 1, 1), "data", "outputs", "fast_snarf", None, "cpu", None)
+PLAIN = MotionSelection("auto", "rest", None, None, 0, 30.0, 0, None, 1, None, None, False)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def walk(tmp_path) -> str:
 
 
 def choose(skeleton: Skeleton, pose: str, **changes):
-    return choose_motion(replace(PLAIN, up="y", **changes), AVATAR, skeleton, pose, None)
+    return select_motion(replace(PLAIN, up="y", **changes), AVATAR, skeleton, pose, None)
 
 
 def test_frames_are_taken_as_asked_for(skeleton, walk):
@@ -82,11 +82,11 @@ def test_stretching_joints_are_kept_and_cannot_be_resampled(skeleton, monkeypatc
     assert stored_motion.__module__ == "snarfcli.samples.stored_motion"
     monkeypatch.setattr(selection, "stored_motion", lambda *arguments: (stretched, transforms))
     own = replace(AVATAR, data=DataConfig("meshes", 1, 1, 1))
-    chosen = choose_motion(replace(PLAIN, start=1, in_place=True), own, other, None, None)
+    chosen = select_motion(replace(PLAIN, start=1, in_place=True), own, other, None, None)
     np.testing.assert_allclose(chosen.bone_transforms[:, :, :3, 3], np.tile([0, 1, 0], (2, 2, 1)), atol=1e-7)
     assert transforms[2, 0, 0, 3] == 1  # what was read is as it was
     with pytest.raises(UserError, match="frame_rate is for motions whose joints do not stretch, those of run do"):
-        choose_motion(replace(PLAIN, frame_rate=60.0), own, other, None, None)
+        select_motion(replace(PLAIN, frame_rate=60.0), own, other, None, None)
 
 
 def test_what_cannot_be_used_is_refused(skeleton, walk):
@@ -99,4 +99,4 @@ def test_what_cannot_be_used_is_refused(skeleton, walk):
         ({"up": "x"}, "up: wanted auto, y or z, got .x."),
     ):
         with pytest.raises(UserError, match=message):
-            check_motion_choice(replace(PLAIN, **changes))
+            check_motion_selection(replace(PLAIN, **changes))

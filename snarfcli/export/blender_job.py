@@ -1,4 +1,4 @@
-"""What runs inside of Blender: read a `.glb`, write `.fbx` or `.usd`. Uses nothing of this package, which Blender may lack."""
+"""Script that runs in Blender: read a `.glb` file, write `.fbx` or `.usd`. It imports nothing of this package."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ _GAP = 10  # frames between clips
 
 
 def main(glb: str, path: str, frame_rate: str, kind: str) -> None:
-    """Convert one file to fbx or usd; keys fall on whole frames of `frame_rate`."""
-    import bpy
+    """Convert one file to fbx or usd, with keys at whole frames of `frame_rate`."""
+    import bpy  # pyright: ignore[reportMissingImports]  # only Blender has it
 
     rate = float(frame_rate)
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -21,9 +21,9 @@ def main(glb: str, path: str, frame_rate: str, kind: str) -> None:
     scene.render.fps_base = rate / scene.render.fps  # 29.97 and the like: the importer multiplies by it
     scene.frame_start = 0
     bpy.ops.import_scene.gltf(filepath=glb, disable_bone_shape=True)
-    scene.render.fps_base = scene.render.fps / rate  # all others divide by it
+    scene.render.fps_base = scene.render.fps / rate  # everything else divides by it
     for item in [item for item in bpy.data.objects if item.type == "EMPTY"]:
-        bpy.data.objects.remove(item)  # what the importer makes of the node of a skinned mesh, and calls as the mesh should be
+        bpy.data.objects.remove(item)  # made of the node of a skinned mesh, with the name of the mesh
     meshes = [item for item in bpy.data.objects if item.type == "MESH"]
     for item in meshes:
         item.name = item.data.name
@@ -36,9 +36,9 @@ def main(glb: str, path: str, frame_rate: str, kind: str) -> None:
             object_types={"ARMATURE", "MESH"},
             add_leaf_bones=False,
             bake_anim_use_all_actions=False,
-            bake_anim_use_nla_strips=True,  # each of the armature's is a take
+            bake_anim_use_nla_strips=True,  # one take per strip of the armature
             bake_anim_simplify_factor=0.0,
-            use_mesh_modifiers=False,  # else no shape keys
+            use_mesh_modifiers=False,  # otherwise there are no shape keys
         )
     else:
         bpy.ops.wm.usd_export(filepath=path, export_animation=True, export_armatures=True, export_shapekeys=True)
@@ -46,9 +46,9 @@ def main(glb: str, path: str, frame_rate: str, kind: str) -> None:
 
 
 def _lay_out(animated: list[Any]) -> int:
-    """Lay the clips one after the other on the timeline, those of the armature and of its shapes alike; return the last frame.
+    """Place the clips of the armature and of its shapes one after the other on the timeline; return the last frame.
 
-    FBX takes are cut from the armature's strips, while all of the shapes' stay: so they must not play at the same time.
+    FBX takes are cut by the strips of the armature, but keep all strips of the shapes: these must not play at the same time.
     """
     lengths: dict[str, float] = {}
     for data in animated:

@@ -1,4 +1,4 @@
-"""The container of a binary glTF 2.0 file: arrays in, bytes out. What they mean is the caller's business.
+"""Build the container of a binary glTF 2.0 file from JSON objects and arrays.
 
 Source: Khronos, glTF 2.0 specification, 3.6 (accessors and their alignment) and 4 (the binary container).
 """
@@ -18,9 +18,9 @@ from snarfcli.files import atomic_path
 __all__ = ["ARRAY_BUFFER", "ELEMENT_ARRAY_BUFFER", "GlbBuilder"]
 
 ARRAY_BUFFER = 34962
-"""Target of a view with attributes of vertices."""
+"""Target of a buffer view with vertex attributes."""
 ELEMENT_ARRAY_BUFFER = 34963
-"""Target of a view with corners of triangles."""
+"""Target of a buffer view with triangle indices."""
 
 _COMPONENTS = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -29,9 +29,10 @@ _LARGEST = 2**32 - 1  # lengths are 32-bit numbers
 
 
 class GlbBuilder:
-    """Collects objects and arrays of one file.
+    """Collects the objects and arrays of one file. `root` is the JSON to be written; `add` creates its lists.
 
-    `root` is the JSON as it will be written; its lists are made on first use by `add`.
+    Args:
+        facts: content of `asset.extras`.
     """
 
     def __init__(self, **facts: Any) -> None:
@@ -41,7 +42,7 @@ class GlbBuilder:
         self._binary = bytearray()
 
     def add(self, collection: str, **item: Any) -> int:
-        """Append an object to a list of the root, such as `nodes`; return its number. What is None is left out."""
+        """Append an object to a list of the root, such as `nodes`; return its index. Properties that are None are left out."""
         items = self.root.setdefault(collection, [])
         items.append({name: value for name, value in item.items() if value is not None})
         return len(items) - 1
@@ -49,21 +50,22 @@ class GlbBuilder:
     def array(
         self, values: np.ndarray, dtype: str = "float32", *, target: int | None = None, bounds: bool = False, **more: Any
     ) -> int:
-        """Add an accessor with a view of its own and return its number.
+        """Add an accessor with its own buffer view; return its index.
 
         Args:
             values: [N] numbers, [N, 2..4] vectors, or [N, 4, 4] matrices, which glTF stores by columns.
             dtype: uint8, uint16, uint32 or float32.
-            target: what a graphics card is to do with it, for what vertices and triangles are made of.
-            bounds: whether the smallest and largest values are written, as positions and times need.
+            target: use of the buffer view by graphics cards, for vertex attributes and triangle indices.
+            bounds: whether minimum and maximum are written, which positions and times need.
             more: further properties, such as `normalized`.
 
         Raises:
-            ValueError: a row has another size than these, numbers are not finite, or rows are not aligned to 4 bytes.
+            ValueError: the shape is another one, a number is not finite, or rows are not aligned to 4 bytes.
         """
         values = np.asarray(values).astype(dtype)
         if not values.size or not np.isfinite(values).all():
-            raise ValueError("values: wanted finite numbers and at least one row")
+            got = f"shape {list(values.shape)}" if not values.size else "NaN or infinity"
+            raise ValueError(f"values: wanted at least one row of finite numbers, got {got}")
         if values.ndim == 3 and values.shape[1:] == (4, 4):
             kind, rows = "MAT4", values.transpose(0, 2, 1).reshape(-1, 16)
         elif values.ndim in (1, 2) and (1 if values.ndim == 1 else values.shape[1]) in _KINDS:
@@ -72,7 +74,7 @@ class GlbBuilder:
         else:
             raise ValueError(f"values: wanted shape [N], [N, 2 to 4] or [N, 4, 4], got {list(values.shape)}")
         if target == ARRAY_BUFFER and rows.strides[0] % 4:
-            raise ValueError(f"values: rows of {rows.strides[0]} bytes are not aligned to 4")
+            raise ValueError(f"values: wanted rows aligned to 4 bytes, got rows of {rows.strides[0]} bytes")
         self._binary.extend(b"\0" * (-len(self._binary) % 4))
         content = np.ascontiguousarray(rows, rows.dtype.newbyteorder("<")).tobytes()
         view = self.add("bufferViews", buffer=0, byteOffset=len(self._binary), byteLength=len(content), target=target)
@@ -83,10 +85,10 @@ class GlbBuilder:
         )
 
     def to_bytes(self) -> bytes:
-        """Return the file.
+        """Return the content of the file.
 
         Raises:
-            ValueError: it would be larger than the format allows.
+            ValueError: it is larger than the format allows, or a number in the JSON is not finite.
         """
         binary = bytes(self._binary) + b"\0" * (-len(self._binary) % 4)
         root = {**self.root, "buffers": [{"byteLength": len(binary)}]}
@@ -94,7 +96,7 @@ class GlbBuilder:
         text += b" " * (-len(text) % 4)
         length = 12 + 8 + len(text) + 8 + len(binary)
         if length > _LARGEST:
-            raise ValueError(f"{length / 2**30:.1f} GiB are more than a .glb file can hold")
+            raise ValueError(f".glb file: wanted at most 4 GiB, got {length / 2**30:.1f} GiB; give fewer triangles or motions")
         head = struct.pack("<III", _MAGIC, 2, length) + struct.pack("<II", len(text), _JSON)
         return head + text + struct.pack("<II", len(binary), _BINARY) + binary
 

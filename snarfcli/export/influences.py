@@ -1,4 +1,4 @@
-"""Few joints a vertex: which of them, and with what weights, so that the surface moves as with all."""
+"""Reduce the number of joints per vertex, with weights for which the surface moves as with all joints."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from snarfcli.bodies.skinning import blend_transforms
 
 __all__ = ["dense_weights", "few_influences", "trial_poses"]
 
-_SPARE = 4  # joints that are looked at beyond those that are kept
-_NEGLIGIBLE = 1e-4  # of a vertex's weight: a tenth of a millimetre where joints move a metre apart
-_PULL_M2 = 1e-6  # towards the learned weights, against a square metre; decides where poses do not
+_SPARE = 4  # candidate joints beyond those that are kept
+_NEGLIGIBLE = 1e-4  # share of the weights of a vertex: a tenth of a millimetre where joints move a metre apart
+_PULL_M2 = 1e-6  # regularisation towards the learned weights, square metres; decides where the poses do not
 _TRIALS = 64
-_TRIAL_RAD = 0.35  # standard deviation of each joint's turns about each axis
-# What all trials together count against all poses of the clips. On a body, jumping jacks are off by 1.4 mm at most, and martial
-# arts that the weights were not made for by 4.5 mm; without trials by 1.0 and 6.4, with trials ten times as heavy by 2.6 and
-# 4.1, and with the largest weights as they are by 15.1 and 18.1.
+_TRIAL_RAD = 0.35  # standard deviation of the rotation of each joint about each axis
+# Weight of all trials together relative to all poses of the clips. Measured maximum errors on a body, for jumping jacks and for
+# martial arts that the weights were not fitted to: 1.4 and 4.5 mm; without trials 1.0 and 6.4 mm; with ten times this weight
+# 2.6 and 4.1 mm; with the largest weights unchanged 15.1 and 18.1 mm.
 _TRIAL_SHARE = 0.01
-_PART = 2000  # vertices at a time: with 128 poses they take 60 MB at most, however many joints there are
+_PART = 2000  # vertices at a time: with 128 poses they take at most 60 MB, for any number of joints
 
 
 def trial_poses(skeleton: Skeleton, transforms: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Add random poses to those of clips: what is fitted to standing still alone would fit no other motion.
+    """Add random poses to those of clips, since weights fitted to a body that stands still would fit no other motion.
 
     Args:
-        skeleton: the joints, which are turned about the canonical pose.
+        skeleton: skeleton, turned randomly about its canonical pose.
         transforms: [S, J, 4, 4] bone transforms of the clips, canonical to posed.
 
     Returns:
-        Transforms [S + 64, J, 4, 4], and what each of them counts, [S + 64].
+        Transforms [S + 64, J, 4, 4], and the weight of each pose, [S + 64].
     """
     skeleton = skeleton.to(dtype=torch.float64, device="cpu")
     turns = np.random.default_rng(0).normal(scale=_TRIAL_RAD, size=(_TRIALS, skeleton.num_joints, 3))
@@ -47,16 +47,16 @@ def few_influences(
     transforms: NDArray[np.float64],
     counts: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Keep `count` joints a vertex, those and with such weights that it moves as with all of them.
+    """Choose `count` joints per vertex, and weights for which it moves as with all joints.
 
-    The largest weights alone would keep three bones of the spine, which move as one, and drop the shoulder, which moves far.
+    The largest weights alone would keep three bones of the spine, which move together, and drop the shoulder, which moves far.
 
     Args:
         weights: [V, J] non-negative, rows sum to 1.
-        count: how many to keep; columns of zeros are added where there are fewer joints.
+        count: number of joints to keep; columns of zeros are added if there are fewer joints.
         vertices: [V, 3] canonical, metres.
-        transforms: [S, J, 4, 4] canonical to posed: poses in which they should move alike.
-        counts: [S] what each pose counts.
+        transforms: [S, J, 4, 4], canonical to posed: poses to fit.
+        counts: [S], weight of each pose.
 
     Returns:
         Joints [V, count], largest weight first, 0 where the weight is zero, and weights [V, count], whose rows sum to 1.
@@ -75,11 +75,12 @@ def few_influences(
         chosen[rows] = np.take_along_axis(joints[rows], order, axis=1)
     best = best.astype(np.float32)
     chosen = np.where(best > 0, chosen, 0)
-    return tuple(np.pad(array, ((0, 0), (0, count - kept))) for array in (chosen, best))
+    padding = np.array([(0, 0), (0, count - kept)])
+    return np.pad(chosen, padding), np.pad(best, padding)
 
 
 def dense_weights(joints: NDArray[np.int64], values: NDArray[np.float32], num_joints: int) -> NDArray[np.float64]:
-    """Return the weights [V, K] of joints [V, K] as weights of all joints [V, J]."""
+    """Return weights [V, K] of joints [V, K] as weights [V, J] of all joints."""
     dense = np.zeros((len(joints), num_joints))
     for joint, value in zip(joints.T, values.T, strict=True):
         dense[np.arange(len(joints)), joint] += value
@@ -95,16 +96,16 @@ def _fitted(
     transforms: NDArray[np.float64],
     counts: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the weights [N, C] of candidates [N, C], all but `kept` of which are zero: they go one by one, least missed first.
+    """Return weights [N, C] of candidates [N, C], all but `kept` of them zero; the least important is removed first.
 
-    With weights v that sum to 1 a vertex is off by sum_c v_c (B_c x - y), where y is its place with all weights: a quadratic
-    form of v, whose matrix G sums over the poses.
+    With weights v that sum to 1 the error of a vertex is sum_c v_c (B_c x - y), where y is its position with all weights. Its
+    square is a quadratic form of v, whose matrix G sums over the poses.
     """
     points = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1, dtype=np.float64)
     apart = np.empty((*joints.shape, len(transforms), 3))
-    weights = weights.astype(np.float64)
+    precise = weights.astype(np.float64)
     for pose, (matrices, share) in enumerate(zip(transforms[:, :, :3], np.sqrt(counts), strict=True)):
-        blended = blend_transforms(weights, matrices)[:, None]
+        blended = blend_transforms(precise, matrices)[:, None]
         apart[:, :, pose] = share * np.einsum("ncab,nb->nca", matrices[joints] - blended, points)
     apart = apart.reshape(*joints.shape, -1)
     products = apart @ apart.transpose(0, 2, 1)
@@ -127,9 +128,9 @@ def _fitted(
 
 
 def _least(products: NDArray[np.float64], prior: NDArray[np.float64], alive: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return weights [N, C], zero where not alive, that sum to 1 and make v G v + pull |v - prior|^2 least.
+    """Return weights v [N, C], zero where not alive, that sum to 1 and minimise v G v + pull |v - prior|^2.
 
-    What comes out negative is cut off, and the rest scaled.
+    Negative weights are set to zero, and the others scaled.
     """
     size = products.shape[1]
     both = alive[:, :, None] & alive[:, None, :]

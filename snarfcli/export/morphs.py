@@ -1,7 +1,7 @@
-"""The pose-dependent shape as few morph targets: principal components of the canonical surface's motion.
+"""The pose-dependent shape as few morph targets: principal components of the motion of the canonical surface.
 
-Linear blend skinning turns and moves each vertex nearly rigidly, so an error of the canonical shape is the same error of the
-posed one: the components are found in the canonical frame, with every vertex and frame counting the same.
+Linear blend skinning moves each vertex nearly rigidly, so errors of the canonical and of the posed shape are equal: the
+components are found in the canonical frame, with equal weights of all vertices and frames.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from numpy.typing import NDArray
 __all__ = ["ShapeBasis", "fit_shapes", "spread_frames"]
 
 _INVISIBLE_M = 1e-5
-"""Components that move no vertex further than this in any frame that they are made from are left out, metres."""
-_ROUNDING = 1e-9  # of the largest component's variance: vertices are float32, of a metre, and the shape moves by centimetres
+"""Components that move every vertex by less than this in all frames are left out, metres."""
+_ROUNDING = 1e-9  # share of the largest variance: vertices are float32, in metres, and the shape moves by centimetres
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeBasis:
-    """A shape, and what is added to it."""
+    """A base shape and morph targets."""
 
     base: NDArray[np.float32]
-    """[V, 3] shape of weights 0, metres."""
+    """[V, 3] shape with weights 0, metres."""
     targets: NDArray[np.float32]
-    """[K, V, 3] what weight 1 adds, metres. Orthogonal to each other; the largest first."""
+    """[K, V, 3] displacements by weight 1, metres; orthogonal, the largest first."""
     rest: NDArray[np.float32]
     """[K] weights of the mean shape."""
 
     def weights(self, shape: NDArray) -> NDArray[np.float32]:
-        """Return the weights [K] that come nearest to a shape [V, 3] (least squares)."""
+        """Return the weights [K] that fit a shape [V, 3] best (least squares)."""
         moved = (shape - self.base).reshape(-1)
         flat = self.targets.reshape(len(self.targets), moved.size)
         return (flat @ moved) / np.einsum("kv,kv->k", flat, flat)
@@ -41,11 +41,10 @@ class ShapeBasis:
         return self.base + np.tensordot(weights.astype(np.float32), self.targets, 1)
 
     def within_unit_range(self, weights: Sequence[NDArray[np.float32]]) -> tuple[ShapeBasis, list[NDArray[np.float32]]]:
-        """Return the same shapes from a base and targets for which all weights [T, K] are from 0 to 1, and these weights.
+        """Return an equivalent basis for which all weights [T, K] are from 0 to 1, and these weights.
 
-        Programs show sliders from 0 to 1, and some cut off what is beyond: Blender's importer widens them for the first key
-        only.
-        Each component starts from that end of its range which is nearer to the mean; `rest` says where the mean is then.
+        Programs show sliders from 0 to 1, and some clip weights to this range: Blender's importer extends it for the first key
+        only. Each component starts at the end of its range that is nearer to the mean; `rest` has the weights of the mean.
         """
         if not len(self.targets):
             return self, list(weights)
@@ -60,7 +59,7 @@ class ShapeBasis:
 
 
 def spread_frames(lengths: Sequence[int], most: int) -> list[tuple[int, int]]:
-    """Return pairs (clip, frame), at most `most`: those in the middle of equal parts of all clips, one after the other."""
+    """Return at most `most` pairs (clip, frame), evenly spread over all clips together."""
     ends = np.cumsum(lengths)
     total = int(ends[-1])
     count = min(most, total)
@@ -70,15 +69,15 @@ def spread_frames(lengths: Sequence[int], most: int) -> list[tuple[int, int]]:
 
 
 def fit_shapes(shapes: NDArray[np.float32], count: int) -> ShapeBasis:
-    """Find the mean of shapes [S, V, 3] and at most `count` components of what differs from it.
+    """Return the mean of shapes [S, V, 3] and at most `count` principal components of the differences from it.
 
-    The mean, not the canonical pose's shape, is what the others are nearest to; that shape is one more frame that nobody plays.
+    The base is the mean, which is nearest to all shapes, and not the shape of the canonical pose, which no clip may contain.
     """
     base = shapes.mean(axis=0, dtype=np.float64).astype(np.float32)
     moved = (shapes - base).reshape(len(shapes), -1)
     if not count or len(shapes) < 2:
         return ShapeBasis(base, np.zeros((0, *base.shape), np.float32), np.zeros(0, np.float32))
-    # S is far smaller than 3 V: the components come from the S x S products, in float64 for the small ones.
+    # S is much smaller than 3 V: the components are found from the S x S products, in float64 for the small ones.
     products = np.zeros((len(shapes), len(shapes)))
     for start in range(0, moved.shape[1], 2**16):
         part = moved[:, start : start + 2**16].astype(np.float64)

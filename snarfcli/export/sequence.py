@@ -1,4 +1,4 @@
-"""Clips as folders of meshes, a file a frame: the avatar's skinned surface itself, with all weights and its own shape."""
+"""Clips as folders of meshes, one file per frame: the skinned surface of the avatar, with all weights and its exact shape."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -19,11 +18,9 @@ from snarfcli.export.clips import Clip
 from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh_files import MESH_WRITERS
+from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.names import folder_names
 from snarfcli.progress import progress
-
-if TYPE_CHECKING:
-    from snarfcli.meshing.skinned import SkinnedSurface
 
 __all__ = ["atomic_folder", "check_folder", "write_sequence"]
 
@@ -33,40 +30,45 @@ _OURS = re.compile(r"frame_\d{6}\.(ply|obj)|export\.json")
 
 
 def check_folder(folder: Path, overwrite: bool) -> Path:
-    """Refuse a folder that holds something, unless it may be replaced and holds nothing but frames.
+    """Check that a folder can be written: it is empty, or contains only frames and `overwrite` is True.
 
     Returns:
-        The folder itself, links followed: it is replaced as a whole, and a link to it stays.
+        The folder with links resolved: it is replaced as a whole, and a link to it stays.
 
     Raises:
-        UserError: it must stay as it is, or cannot be replaced.
+        UserError: it cannot or must not be replaced.
     """
     try:
         place = folder.resolve()
     except (OSError, RuntimeError) as error:  # links in a circle
-        raise UserError(f"{folder} cannot be followed ({error}); give output=FOLDER") from None
+        raise UserError(
+            f"{folder}: wanted a folder, got a link that cannot be resolved ({error}); give output=FOLDER"
+        ) from None
     if place.exists() and not place.is_dir():
-        raise UserError(f"{folder} is a file, not a folder; give output=FOLDER")
+        raise UserError(f"{folder}: wanted a folder, got a file; give output=FOLDER")
     if place.is_dir() and (Path.cwd().is_relative_to(place) or place.is_mount()):
-        raise UserError(f"{folder} holds the current folder or is a disk, and is replaced as a whole; give output=FOLDER in it")
+        raise UserError(
+            f"{folder}: wanted a folder that can be replaced as a whole, got a disk or a parent of the current folder; "
+            "give output=FOLDER in it"
+        )
     there = [path for path in place.rglob("*") if path.is_symlink() or not path.is_dir()] if place.is_dir() else []
     if there and not overwrite:
-        raise UserError(f"{folder} holds {there[0].name} already; give overwrite=true to replace it, or output=FOLDER")
+        raise UserError(f"{folder} contains {there[0].name} already; give overwrite=true to replace it, or output=FOLDER")
     foreign = [path for path in there if path.is_symlink() or not _OURS.fullmatch(path.name)]
     if foreign:
-        raise UserError(f"{folder} holds {foreign[0].name}, which is no frame of an export; give output=FOLDER")
+        raise UserError(f"{folder}: wanted only frames of an export, got {foreign[0].name}; give output=FOLDER")
     return place
 
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `folder` that takes its place when the block succeeds and vanishes when it fails.
+    """Yield a temporary folder that replaces `folder` when the block succeeds, and is deleted when it fails.
 
     Args:
-        folder: where to, see `check_folder`; what is there is moved aside first and deleted last.
+        folder: result of `check_folder`; its old content is moved aside first and deleted last.
 
     Raises:
-        UserError: the place cannot be taken; what was there is still there, and the message says where the new files are.
+        UserError: it cannot be replaced; the old content is kept, and the message names the folder of the new files.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     token = secrets.token_hex(4)
@@ -91,19 +93,20 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 def write_sequence(
     folder: Path, surface: SkinnedSurface, clips: Sequence[Clip], suffix: str, *, weight_colors: bool = False
 ) -> list[tuple[str, int, str]]:
-    """Write `frame_000000.ply` and so on into a folder, several clips into a folder each.
+    """Write `frame_000000.ply` and so on into a folder; several clips get one subfolder each.
 
     Args:
-        folder: where to; it is there.
-        surface: the skinned surface.
+        folder: existing folder.
+        surface: skinned surface of the avatar.
         clips: motions, at least one.
         suffix: ply or obj.
         weight_colors: whether vertices are coloured by their weights.
 
     Returns:
-        Clip, frame and reason of those that have no surface, whose number is left out.
+        Clip, frame and reason of frames without a surface; their numbers are left out.
     """
     skipped = []
+    assert surface.mesh.weights is not None
     colors = weights_to_colors(surface.mesh.weights) if weight_colors else None
     for name, clip in zip(folder_names(clip.motion.name for clip in clips), clips, strict=True):
         place = folder

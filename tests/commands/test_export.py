@@ -133,7 +133,7 @@ def test_a_mesh_a_frame(folder, toy, capsys, suffix):
     (place / "notes.txt").write_text("mine")
     code, err = export(capsys, *arguments, "overwrite=true")
     assert code == 2
-    assert "holds notes.txt, which is no frame of an export" in err
+    assert ": wanted only frames of an export, got notes.txt" in err
     assert (place / "notes.txt").exists()
 
 
@@ -168,14 +168,19 @@ def test_folders_that_cannot_be_replaced_are_refused_at_once(folder, toy, capsys
     Path("links").mkdir()
     (Path("links") / "frame_000000.ply").symlink_to("nowhere")
     for place, message in (
-        (".", ". holds the current folder or is a disk, and is replaced as a whole; give output=FOLDER in it"),
-        ("..", ".. holds the current folder"),
-        ("circle", "circle cannot be followed"),
-        ("links", "links holds frame_000000.ply, which is no frame of an export"),
-        ("walk.npz", "walk.npz is a file, not a folder"),
+        (
+            ".",
+            ".: wanted a folder that can be replaced as a whole, got a disk or a parent of the current folder; give output=",
+        ),
+        ("..", "..: wanted a folder that can be replaced as a whole"),
+        ("circle", "circle: wanted a folder, got a link that cannot be resolved"),
+        ("links", "links: wanted only frames of an export, got frame_000000.ply"),
+        ("walk.npz", "walk.npz: wanted a folder, got a file"),
     ):
         code, err = export(capsys, *arguments, f"output={place}")
-        assert code == 2 and message in err and len(err.splitlines()) == 1, err
+        assert code == 2, err
+        assert message in err
+        assert len(err.splitlines()) == 1, err
     assert (Path("links") / "frame_000000.ply").is_symlink()
 
 
@@ -351,7 +356,7 @@ def test_without_blender_one_line_says_how_to_get_it(folder, toy, capsys, fake_b
     monkeypatch.setattr(toy, "skinned_surface", None)  # nothing is made
     code, err = export(capsys, "--pose", pose_file("walk.npz"), "format=fbx")
     assert code == 2
-    assert "fbx and usd are written by Blender, which is not here; pip install 'snarf[blender]'" in err
+    assert "format: wanted Blender for fbx and usd, got no Blender; pip install 'snarf[blender]'" in err
 
 
 def test_blender_gets_a_whole_glb(folder, capsys, fake_blender):

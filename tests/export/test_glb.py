@@ -59,8 +59,8 @@ def test_objects_leave_out_what_is_none():
     [
         (np.zeros((2, 5)), {}, r"wanted shape \[N\], \[N, 2 to 4\] or \[N, 4, 4\], got \[2, 5\]"),
         (np.zeros((0, 3)), {}, "at least one row"),
-        ([[np.nan, 0, 0]], {}, "wanted finite numbers"),
-        (np.zeros((2, 3)), {"dtype": "uint8", "target": ARRAY_BUFFER}, "rows of 3 bytes are not aligned to 4"),
+        ([[np.nan, 0, 0]], {}, "wanted at least one row of finite numbers"),
+        (np.zeros((2, 3)), {"dtype": "uint8", "target": ARRAY_BUFFER}, "wanted rows aligned to 4 bytes, got rows of 3 bytes"),
     ],
 )
 def test_what_cannot_be_stored(values, options, message):

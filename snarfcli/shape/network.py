@@ -33,7 +33,7 @@ class ShapeConfig:
     frequencies: list[float] = field(default_factory=list)
     """Angular frequencies of a sine and cosine encoding of the point, radians per metre; an empty list for no encoding."""
     condition_layer: int | None = 6
-    """Layer that gets the pose condition, unless condition.layer is set (as with condition=local); null for no pose condition."""
+    """Layer that gets the pose condition, unless condition.layer is set (as with condition=local); null for no condition."""
     condition_size: int = 8
     """Size of the code to which the pose condition is reduced first, unless condition.size is set."""
     condition_at_start: bool = True

@@ -17,7 +17,7 @@ from snarfcli.training.settings import TrainingConfig
 
 __all__ = ["Batch", "FrameBatches", "FreshBatches", "load_frames", "new_batches"]
 
-_MOST_WORKERS = 8  # of those that are not asked for; a batch of the largest preset takes one of them 0.13 s
+_MOST_WORKERS = 8  # maximum with workers=null; a batch of the largest preset takes one process 0.13 s
 
 
 @dataclass
@@ -25,32 +25,32 @@ class Batch:
     """Sampled points of B frames."""
 
     points: Tensor
-    """[B, N, 3], posed space, metres."""
+    """[B, N, 3], posed frame, metres."""
     occupied: Tensor
-    """bool [B, N]."""
+    """[B, N] bool."""
     bone_transforms: Tensor
-    """[B, J, 4, 4], canonical to posed."""
+    """[B, J, 4, 4], canonical to posed, metres."""
     pose: Tensor
     """[B, J, 3] axis-angle, radians."""
     cube: Tensor
-    """[B, 2, 3] lower and upper corner of the cube that holds a frame's points; outside it nothing is occupied. Metres."""
+    """[B, 2, 3], lower and upper corner of the cube that holds the points of a frame, metres; outside, nothing is occupied."""
 
 
 class FrameBatches:
-    """Draw random frames and stored points of them; step k gives the same batch in every run with the same seed.
+    """Batches of random frames and stored points; step k has the same batch in every run with the same seed.
 
     Args:
         store: processed samples of one subject.
-        config: how many frames and points.
-        seed: of the whole run.
-        device: where the batches go.
+        config: gives the numbers of frames and points.
+        seed: of the run.
+        device: of the batches.
     """
 
     def __init__(self, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> None:
         self.sequences = store.sequences("train")
         self.frames = [(index, int(frame)) for index, s in enumerate(self.sequences) for frame in s.train_frames]
         if not self.frames:
-            raise UserError('the samples hold no training frames; run "snarf preprocess" with the training sequences')
+            raise UserError('the samples have no training frames; run "snarf preprocess" with the training sequences')
         self.config, self.seed, self.device = config, seed, device
 
     def batch(self, step: int) -> Batch:
@@ -68,7 +68,7 @@ class FrameBatches:
         return load_frames(picks, self.device)
 
     def poses(self, count: int, random: np.random.Generator | None = None) -> Tensor:
-        """Return the poses [P, J, 3] of `count` training frames, or all if there are fewer: random ones, or evenly spaced."""
+        """Return the poses [P, J, 3] of at most `count` training frames: random ones, or evenly spaced without `random`."""
         count = min(count, len(self.frames))
         if random is None:
             chosen = np.linspace(0, len(self.frames) - 1, count).round().astype(int)
@@ -78,14 +78,14 @@ class FrameBatches:
         return torch.as_tensor(np.stack(poses), dtype=torch.float32, device=self.device)
 
     def close(self) -> None:
-        """End whatever makes batches ahead of time; the next batch starts it again."""
+        """End the processes that make batches ahead of time; the next batch starts them again."""
 
 
 class FreshBatches(FrameBatches):
-    """Draw random frames and points that no other step has; step k gives the same batch in every run with the same seed.
+    """Batches of random frames and new points; step k has the same batch in every run with the same seed.
 
-    The points are labelled here if `config.workers` is 0, otherwise ahead of time by processes: so many, or one fewer than
-    there are cores.
+    The points are drawn and labelled here if `config.workers` is 0, otherwise ahead of time by that number of processes, or by
+    one fewer than the number of cores if it is None.
     """
 
     def __init__(self, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> None:
@@ -102,10 +102,10 @@ class FreshBatches(FrameBatches):
         self._ahead = Prefetch(draw_steps, (self._fresh,), workers, "training.workers=1") if workers else None
 
     def batch(self, step: int) -> Batch:
-        """Return the batch of one step, waiting for it where need be.
+        """Return the batch of one step; waits until it is ready.
 
         Raises:
-            UserError: a mesh cannot be used, or a process ended early. No process is left then.
+            UserError: a mesh cannot be used, or a process ended early. All processes have ended then.
         """
         drawn: DrawnPoints = self._ahead.get(step) if self._ahead else self._fresh.draw(step)
         picks = [(self.sequences[sequence], frame) for sequence, frame in drawn.frames]
@@ -117,19 +117,19 @@ class FreshBatches(FrameBatches):
 
 
 def new_batches(store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> FrameBatches:
-    """Return what makes the batches that `config` asks for; the arguments are those of `FrameBatches`."""
+    """Return the batches of the kind that `config` chooses; for the arguments see `FrameBatches`."""
     return (FreshBatches if config.fresh_points else FrameBatches)(store, config, seed, device)
 
 
 def load_frames(picks: list, device: torch.device) -> Batch:
-    """Gather frames, given as tuples (sequence, frame, point indices), into one batch."""
+    """Return one batch of frames, given as tuples (sequence, frame, point indices)."""
     points = np.stack([sequence.points(frame, index) for sequence, frame, index in picks])
     occupied = np.stack([sequence.occupancies(frame, index) for sequence, frame, index in picks])
     return _gather([(sequence, frame) for sequence, frame, _ in picks], points, occupied, device)
 
 
 def _gather(frames: list, points: np.ndarray, occupied: np.ndarray, device: torch.device) -> Batch:
-    """Put points [B, N, 3] and labels [B, N] together with the poses of their frames, given as tuples (sequence, frame)."""
+    """Return one batch of points [B, N, 3] and labels [B, N] with the poses of their frames, tuples (sequence, frame)."""
     transforms = np.stack([sequence.bone_transforms[frame] for sequence, frame in frames])
     pose = np.stack([sequence.poses[frame] for sequence, frame in frames])
     cube = np.stack([sequence.cube(frame) for sequence, frame in frames])

@@ -1,6 +1,6 @@
 """Points that are drawn and labelled anew in every step, from the posed meshes in the store.
 
-Worker processes import this file, so it does without PyTorch.
+Worker processes import this file, so it must not import PyTorch.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ class DrawnPoints:
     """Labelled points of one step: B frames of N points."""
 
     frames: list[tuple[int, int]]
-    """For each of the B frames its sequence, by number, and its number within that."""
+    """Index of the sequence, and of the frame in it, for each of the B frames."""
     points: np.ndarray
-    """[B, N, 3] float32, posed space, metres: first the uniform ones, then those near the surface."""
+    """[B, N, 3] float32, posed frame, metres: first the uniform ones, then those near the surface."""
     occupied: np.ndarray
     """[B, N] bool."""
 
 
 class FreshPoints:
-    """Draw frames, and points around their meshes; step k gives the same ones wherever it is drawn.
+    """Random frames and points around their meshes; step k has the same points in every process.
 
     Args:
         sequences: training sequences.
-        settings: those that the samples were made with: seed aside, the same points but for the Poisson disks, which take
-            too long for every step; the points near the surface are uniform on it before the noise.
-        frames_per_step: number of frames B of a step.
-        uniform: number of points of a frame that are uniform in its cube.
-        surface: number of points of a frame that are near its surface.
+        settings: with which the samples were made. The points have the same distribution, except that before the noise those
+            near the surface are uniform on it: Poisson disks take too long for every step.
+        frames_per_step: number of frames B per step.
+        uniform: number of points per frame that are uniform in its cube.
+        surface: number of points per frame that are near its surface.
         seed: of the run.
     """
 
@@ -56,7 +56,7 @@ class FreshPoints:
         self.frames = [(index, int(frame)) for index, s in enumerate(sequences) for frame in s.train_frames]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Memory maps would be pickled as copies, so another process opens the files again.
+        # Memory maps would be pickled as copies, so the other process opens the files again.
         places = [(sequence.folder.absolute(), sequence.description) for sequence in self.sequences]
         return _reopen, (places, self.settings, self.frames_per_step, self.uniform, self.surface, self.seed)
 
@@ -74,14 +74,14 @@ class FreshPoints:
         return DrawnPoints(frames, np.stack([points for points, _ in drawn]), np.stack([inside for _, inside in drawn]))
 
     def _draw_frame(self, sequence: SequenceSamples, frame: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Return points [N, 3] of one frame, and which are inside [N]."""
+        """Return points [N, 3] of one frame, and which of them are inside, [N]."""
         vertices, faces = sequence.vertices(frame), sequence.faces(frame)
         lower, upper = sequence.cube(frame)
         uniform = lower + random.random((self.uniform, 3)) * (upper - lower)
-        is_planar = self.settings.get("is_planar", False)  # only samples of the plane z = 0 say so
+        is_planar = self.settings.get("is_planar", False)  # only samples of planar subjects have it
         near = (outline_samples if is_planar else uniform_surface_samples)(vertices, faces, self.surface, random)
         near += random.normal(scale=self.settings["surface_noise_m"], size=near.shape)
-        points = np.clip(np.concatenate([uniform, near]), lower, upper).astype(np.float32)  # as the stored points are
+        points = np.clip(np.concatenate([uniform, near]), lower, upper).astype(np.float32)  # like the stored points
         if is_planar:
             points[:, 2] = 0.0
         inside = occupancies(vertices, faces, points, self.settings["inside_test"])
@@ -99,4 +99,5 @@ def draw_steps(points: FreshPoints, first: int, stride: int) -> Iterator[DrawnPo
 
 
 def _reopen(places: list[tuple[Any, dict[str, Any]]], *arguments: Any) -> FreshPoints:
+    """Return the points of sequences given by folder and description; see `FreshPoints.__reduce__`."""
     return FreshPoints([SequenceSamples(folder, description) for folder, description in places], *arguments)

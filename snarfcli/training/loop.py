@@ -12,6 +12,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from snarfcli.files import write_tensors
 from snarfcli.training.trainer import Trainer
 
@@ -19,17 +21,17 @@ __all__ = ["train"]
 
 log = logging.getLogger(__name__)
 _REPORT_EVERY_S = 15.0
-_LAST_STEPS = 50  # losses are reported as the mean of so many steps
+_LAST_STEPS = 50  # reported losses are means over this number of steps
 
 
 def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str, float]], None]) -> dict[str, Any]:
     """Run all remaining steps, with checkpoints in `folder`.
 
-    Ctrl-C lets the running step end, writes a checkpoint and raises KeyboardInterrupt; a second one stops at once.
+    Ctrl-C finishes the running step, writes a checkpoint and raises KeyboardInterrupt; a second one stops at once.
 
     Args:
-        trainer: fresh or restored.
-        folder: the run folder; `checkpoint.pt` in it is replaced now and then.
+        trainer: new or restored.
+        folder: the run folder; its `checkpoint.pt` is replaced every `checkpoint_every` steps.
         on_scalars: called with the step and named numbers, for TensorBoard.
 
     Returns:
@@ -70,7 +72,7 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
                 log.info("step %d of %d, %s, %.0f s left", step, config.steps, line, remaining)
     seconds = time.monotonic() - start - paused
     steps = trainer.step - first_step
-    validation = validation or trainer.validate()  # a run that was interrupted after its last step has none yet
+    validation = validation or trainer.validate()  # a run interrupted after its last step has none yet
     return {
         "validation": validation,
         "steps_this_run": steps,
@@ -83,7 +85,7 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
 
 
 def _line(recent: list[dict[str, float]], validation: dict[str, float], points_per_second: float) -> str:
-    """Return losses, validation and speed in one short line."""
+    """Return losses, speed and validation as one short line."""
     names = [n for n in recent[-1] if n not in ("total", "inside_without_correspondence", "correspondences_per_point")]
     losses = ", ".join(f"{name.replace('_', ' ')} {_mean(recent, name):.4f}" for name in names)
     lost = _mean(recent, "inside_without_correspondence")
@@ -106,15 +108,13 @@ def _bar(steps: int, first_step: int) -> Iterator[Any]:
     if not sys.stderr.isatty():
         yield None
         return
-    from tqdm import tqdm
-
     with tqdm(total=steps, initial=first_step, desc="train", unit="step", dynamic_ncols=True) as bar:
         yield bar
 
 
 @contextmanager
 def _interrupt_between_steps() -> Iterator[threading.Event]:
-    """Yield an event that the first Ctrl-C sets, so that a step is never cut in half; the second raises as usual."""
+    """Yield an event that the first Ctrl-C sets, so that the running step is finished; the second raises KeyboardInterrupt."""
     event = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield event

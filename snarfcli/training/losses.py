@@ -11,18 +11,19 @@ from torch.nn import functional as F
 __all__ = ["JOINT_TARGETS", "joint_weight_targets", "occupancy_loss", "points_on_bones"]
 
 JOINT_TARGETS = ("halves", "parent", "own")
+"""Target weights at a joint, see `joint_weight_targets`."""
 
 
 def occupancy_loss(logits: Tensor, occupied: Tensor, found: Tensor) -> Tensor:
     """Return the binary cross-entropy of the posed field, averaged over all points.
 
-    A point without a correspondence has no gradient and adds nothing: it is outside for certain, and where it should be
-    inside, no shape can mend that. Such points are counted by the training loop.
+    A point without a correspondence adds nothing, as its prediction, outside, does not depend on the shape. The training loop
+    counts such points that are inside.
 
     Args:
         logits: [B, N].
-        occupied: ground truth, bool [B, N].
-        found: which points have a correspondence, bool [B, N].
+        occupied: [B, N] bool, ground truth.
+        found: [B, N] bool, which points have a correspondence.
 
     Source: SNARF Sec. 3.3.
     """
@@ -37,18 +38,18 @@ def points_on_bones(bones: Tensor, count: int, generator: torch.Generator) -> Te
 
 
 def joint_weight_targets(parents: Sequence[int], target: str) -> Tensor:
-    """Return the wanted skinning weights at the joints, [J, J], rows sum to 1.
+    """Return the target skinning weights at the joints, [J, J], rows sum to 1.
 
     Args:
-        parents: parent of each joint, -1 for the root.
-        target: "halves" for the bones on either side of the joint (SNARF Sec. 3.3), "parent" for the parent's bone
-            (Fast-SNARF Sec. 3) or "own" for the joint's own (what the released code does). The root's is always its own.
+        parents: [J], parent of each joint, -1 for the root.
+        target: "halves" for a half on each of the bones that meet at the joint (SNARF Sec. 3.3), "parent" for the bone of the
+            parent (Fast-SNARF Sec. 3) or "own" for the joint's own bone (the released code). The root always has its own bone.
 
     Raises:
         ValueError: unknown `target`.
     """
     if target not in JOINT_TARGETS:
-        raise ValueError(f"training.joint_target must be one of {', '.join(JOINT_TARGETS)}, got {target!r}")
+        raise ValueError(f"training.joint_target: wanted one of {', '.join(JOINT_TARGETS)}, got {target!r}")
     own_share = {"halves": 0.5, "parent": 0.0, "own": 1.0}[target]
     wanted = torch.zeros(len(parents), len(parents))
     for joint, parent in enumerate(parents):

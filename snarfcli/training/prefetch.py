@@ -1,4 +1,4 @@
-"""Results made ahead of time by worker processes, and taken in order."""
+"""Results made ahead of time by worker processes and received in order."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ __all__ = ["Prefetch"]
 
 
 class Prefetch:
-    """Results number k, k + 1, k + 2 and so on of a function, made by worker processes while the caller does something else.
+    """Results number k, k + 1, k + 2 and so on of a function, made by worker processes while the caller continues.
 
-    DESIGN. Of W processes each makes every W-th result and sends it through a pipe of its own, so results are taken in
-    order without a queue to sort them. A process that is ahead waits in the pipe until it is asked: at most one large
-    result, or 64 kB of small ones, is waiting in each, and nothing else bounds memory. When the caller dies, sending fails
-    and the processes end.
+    DESIGN. Each of W processes makes every W-th result and sends it through its pipe, so results are received in order without
+    a sorting queue. A process that is ahead blocks on its pipe: at most one large result, or 64 kB of small ones, waits in
+    each, which is the only bound on memory. When the caller dies, sending fails and the processes end.
 
     Args:
         function: module-level generator function `function(*arguments, first, stride)` that yields the results of numbers
             `first`, `first + stride` and so on without end. A number must give the same result in any process.
-        arguments: picklable.
+        arguments: of the function, picklable.
         workers: number of processes, at least 1.
-        fewer: how the user asks for fewer workers.
+        fewer: setting that reduces the number of workers, for messages.
     """
 
     def __init__(self, function: Callable[..., Iterator[Any]], arguments: tuple[Any, ...], workers: int, fewer: str) -> None:
@@ -32,11 +31,11 @@ class Prefetch:
         self._first = self._next = 0
 
     def get(self, number: int) -> Any:
-        """Return the result of one number; the processes start anew unless it follows the last one that was asked for.
+        """Return the result of one number; the processes restart unless it follows the previous one.
 
         Raises:
-            UserError: a process ended without a word.
-            Exception: whatever the function raised. No process is left then.
+            UserError: a process was killed, for example by the out-of-memory killer.
+            Exception: the function raised it. All processes have ended then.
         """
         try:
             if not self._workers or number != self._next:
@@ -57,7 +56,7 @@ class Prefetch:
                 self._workers.append(Worker(self._function, task, self._fewer))
 
     def close(self) -> None:
-        """End all processes; harmless when there are none."""
+        """End all processes, if there are any."""
         while self._workers:
             self._workers[-1].end()
             self._workers.pop()

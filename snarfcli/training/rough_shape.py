@@ -1,4 +1,4 @@
-"""Where the body of a subject lies in the canonical frame, judged from its training frames."""
+"""A rough canonical shape of a subject, estimated from its training frames."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from snarfcli.samples.store import SampleStore
 
 __all__ = ["rough_canonical_points"]
 
-_FRAMES = 8
-_POINTS = 1024  # of the surface, and as many inside
+_FRAMES = 8  # number of training frames used
+_POINTS = 1024  # number of points on the surface, and of points inside
 
 
 def rough_canonical_points(store: SampleStore) -> Tensor:
-    """Return points of the body [K, 3] in the canonical frame, metres, right to a few centimetres, and the joints.
+    """Return points of the body and its joints, [K, 3], canonical frame, metres, exact to a few centimetres.
 
-    No template and no skinning weights are used: in the training frames nearest to the canonical pose the mesh's vertices, and
-    the samples inside it, are taken back rigidly, bone by bone. Vertices alone would leave out the middle of a large part
-    with few of them. The first and last points along each axis are kept, the others thinned out.
+    No template and no skinning weights are used: in the training frames nearest to the canonical pose the vertices of the mesh,
+    and the samples inside it, are moved back rigidly by their nearest bone. Vertices alone would omit the middle of a large
+    part with few vertices. The outermost points along each axis are kept, the others thinned out.
 
     Raises:
-        UserError: the samples hold no training frames.
+        UserError: the samples have no training frames.
     """
     skeleton = store.skeleton.to(torch.float32)
     frames = [(s, int(frame)) for s in store.sequences("train") for frame in s.train_frames]
     if not frames:
-        raise UserError('the samples hold no training frames; run "snarf preprocess" with the training sequences')
+        raise UserError('the samples have no training frames; run "snarf preprocess" with the training sequences')
     poses = np.stack([sequence.poses[frame] for sequence, frame in frames])
     distance = np.abs(poses[:, 1:] - skeleton.canonical_pose.numpy()[None, 1:]).sum((1, 2))
     surface, inside = [], []

@@ -1,10 +1,11 @@
-"""One optimiser step after the other: the state of a training run and what a step does to it."""
+"""The state of a training run and its optimiser steps."""
 
 from __future__ import annotations
 
 import copy
 import math
 from dataclasses import asdict, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch.nn import functional as F
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import iou
 from snarfcli.models.extent import bone_owners, bone_segments
+from snarfcli.models.system import Found
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.precision import PRECISIONS, matmul_precision
 from snarfcli.samples.store import SampleStore
@@ -27,8 +29,8 @@ __all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Diverged", "Trainer"]
 CHECKPOINT_FORMAT = "snarf-checkpoint"
 CHECKPOINT_VERSION = 1
 
-_POSES_OF_A_REFRESH = 4  # training poses in which the learned shape is looked at
-_POSES_AT_THE_END = 24
+_POSES_OF_A_REFRESH = 4  # number of training poses from which the searched cells are updated
+_POSES_AT_THE_END = 24  # the same for the finished avatar
 
 
 class Diverged(UserError):
@@ -38,22 +40,25 @@ class Diverged(UserError):
 class Trainer:
     """Train an avatar's networks on the samples of one subject.
 
-    All randomness comes from the seed and the number of the step, and from PyTorch's generator, whose state a checkpoint
-    holds: a resumed run takes the same steps as an uninterrupted one.
+    All randomness comes from the seed, the number of the step and PyTorch's generator, whose state is part of a checkpoint: a
+    resumed run takes the same steps as an uninterrupted one.
 
     Args:
         avatar: the avatar to train, on `device`.
         store: processed samples.
         config: settings.
         seed: of the run.
-        device: where to compute.
+        device: on which to compute.
+
+    Raises:
+        ValueError: `config.precision` or `config.joint_target` is unknown.
     """
 
     def __init__(
         self, avatar: TrainedField, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device
     ) -> None:
         if config.precision not in PRECISIONS:
-            raise ValueError(f"training.precision must be one of {', '.join(PRECISIONS)}, got {config.precision!r}")
+            raise ValueError(f"training.precision: wanted one of {', '.join(PRECISIONS)}, got {config.precision!r}")
         self.avatar, self.store, self.config, self.seed, self.device = avatar, store, config, seed, device
         self.model = avatar.model.to(device)
         self.model.train()
@@ -82,18 +87,20 @@ class Trainer:
             group["lr"] = self.learning_rate()
         if self.config.far_points:
             batch = self._with_far_points(batch)
-        field = self.model(batch.points, batch.bone_transforms, batch.pose, self.config.precision)
+        found = self.model.find(batch.points, batch.bone_transforms, batch.pose)
+        field = self.model.shape_at(found, batch.pose, self.config.precision)
         losses = {"occupancy": occupancy_loss(field.logits, batch.occupied, field.found)}
         if self.step < self.config.bootstrap_steps:
-            losses |= self._bootstrap_losses(batch)
+            losses |= self._bootstrap_losses(batch, found)
         losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._generator(5), self.config.precision)
-        total = sum(losses.values())
-        self._refuse_diverged("loss", total)
+        total = reduce(torch.add, losses.values())
+        self._check_finite("loss", total)
         self.optimizer.zero_grad(set_to_none=True)
         with matmul_precision("medium" if self.config.precision == "bfloat16" else self.config.precision):
             total.backward()
         gradients = [p.grad for p in self.parameters if p.grad is not None]
-        self._refuse_diverged("gradient", torch.stack(torch._foreach_norm(gradients)).sum())
+        norms = torch._foreach_norm(gradients)  # pyright: ignore[reportPrivateImportUsage]  # no public name
+        self._check_finite("gradient", torch.stack(norms).sum())
         self.optimizer.step()
         self.step += 1
         self._update_average()
@@ -103,8 +110,8 @@ class Trainer:
         numbers |= {"correspondences_per_point": field.correspondences / max(batch.occupied.numel(), 1)}
         return numbers
 
-    def _refuse_diverged(self, what: str, value: Tensor) -> None:
-        """Stop before a step that would spoil the weights."""
+    def _check_finite(self, what: str, value: Tensor) -> None:
+        """Raise Diverged before a step that would spoil the weights."""
         if not bool(value.isfinite()):
             raise Diverged(
                 f"diverged: the {what} is {value.item()} at step {self.step}; lower training.learning_rate, now "
@@ -112,16 +119,16 @@ class Trainer:
             )
 
     def _generator(self, purpose: int) -> torch.Generator:
-        """Return a generator for one purpose in the coming step."""
+        """Return the random generator for one purpose in the coming step."""
         seed = int(np.random.default_rng([self.seed, self.step, purpose]).integers(2**62))
         return torch.Generator().manual_seed(seed)
 
     @torch.no_grad()
     def _with_far_points(self, batch: Batch) -> Batch:
-        """Return the batch with points behind its own that lie outside the cubes of its frames, where nothing is occupied.
+        """Append points outside the cubes of the frames of a batch, where nothing is occupied.
 
-        Nobody samples there, so a piece of the shape that every frame moves out of its cube would never be noticed, as one
-        beyond the nose of an animal. A point that stays inside a cube, where it has no label, goes to where no cell reaches.
+        There are no samples outside, so they would not show a part of the shape that every pose moves out of the cube, such as
+        one beyond the nose of an animal. A point inside a cube, where its label is unknown, is moved beyond all cells.
         """
         points = self.model.far_points(self.config.far_points, batch.bone_transforms, self._generator(4))
         if points is None:
@@ -139,14 +146,14 @@ class Trainer:
         cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, self.step / max(config.steps, 1))))
         return config.learning_rate * warm * (config.final_learning_rate + (1 - config.final_learning_rate) * cosine)
 
-    def _bootstrap_losses(self, batch: Batch) -> dict[str, Tensor]:
+    def _bootstrap_losses(self, batch: Batch, found: Found) -> dict[str, Tensor]:
         """Return the losses that fill the bones and tie the joints to their bones (SNARF Sec. 3.3)."""
         losses, config = {}, self.config
         transforms, pose = batch.bone_transforms, batch.pose
         if config.bone_occupancy_weight > 0:
             points = points_on_bones(self.bones, config.bone_points, self._generator(1))
             owner = self.bone_owners.repeat_interleave(config.bone_points)
-            logits = self.model.bone_logits(points, owner, transforms, pose, config.precision)
+            logits = self.model.bone_logits(points, owner, transforms, pose, config.precision, found)
             entropy = F.binary_cross_entropy_with_logits(logits, torch.ones_like(logits))
             losses["bone_occupancy"] = config.bone_occupancy_weight * entropy
         if config.joint_weight > 0:
@@ -157,9 +164,10 @@ class Trainer:
 
     @torch.no_grad()
     def _update_average(self) -> None:
-        """Move the averaged weights towards the current ones; quickly at first, since the first weights are worth little."""
+        """Move the averaged weights towards the current ones; quickly at first, since the first weights are poor."""
         decay = min(self.config.average_decay, (1 + self.step) / (10 + self.step))
-        torch._foreach_lerp_(self.average, [p.detach() for p in self.parameters], 1 - decay)
+        current = [p.detach() for p in self.parameters]
+        torch._foreach_lerp_(self.average, current, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]  # no public name
 
     def averaged_avatar(self) -> TrainedField:
         """Return a copy of the avatar with the averaged weights, ready to use."""
@@ -171,7 +179,7 @@ class Trainer:
         return avatar.to(self.device)
 
     def finished_avatar(self) -> TrainedField:
-        """Return the averaged avatar, with cells to search that fit the shape that it has in the training poses."""
+        """Return the averaged avatar, its searched cells shrunk to its shape in training poses."""
         avatar = self.averaged_avatar()
         avatar.model.tighten_cells(self.batches.poses(_POSES_AT_THE_END), self.config.precision)
         return avatar
@@ -197,7 +205,7 @@ class Trainer:
 
     # ---------------------------------------------------------------- checkpoints
     def state(self) -> dict[str, Any]:
-        """Return everything that the coming steps depend on, as plain dicts and tensors."""
+        """Return all state on which the coming steps depend, as plain dicts and tensors."""
         return {
             "format": CHECKPOINT_FORMAT,
             "version": CHECKPOINT_VERSION,
@@ -214,13 +222,12 @@ class Trainer:
         """Continue from `state`; `path` names the checkpoint in messages.
 
         Raises:
-            UserError: the state belongs to other settings, or does not fit.
+            UserError: the state has other settings, or does not fit.
         """
-        same = {"workers": self.config.workers}  # steps are the same whatever their number
+        same = {"workers": self.config.workers}  # the steps do not depend on it
         ours = self.avatar.to_dict()["config"] | {"training": asdict(self.config), "seed": self.seed}
         try:
-            training = {"fresh_points": False} | state["training"] | same  # runs from before there were any had no such setting
-            theirs = state["avatar"]["config"] | {"training": training, "seed": state["seed"]}
+            theirs = state["avatar"]["config"] | {"training": state["training"] | same, "seed": state["seed"]}
         except (KeyError, TypeError):
             raise UserError(f"{path} is incomplete; start again with overwrite=true") from None
         changed = _differences(theirs, ours)

@@ -169,13 +169,6 @@ def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path) -> None:
         other.restore(first.state(), "checkpoint.pt")
 
 
-def test_runs_from_before_there_were_fresh_points_resume(store) -> None:
-    trainer = Trainer(new_avatar(store), store, training_config(), 0, CPU)
-    state = trainer.state()
-    del state["training"]["fresh_points"], state["training"]["workers"]
-    trainer.restore(state, "checkpoint.pt")
-
-
 def test_a_failure_of_a_worker_ends_the_training_in_one_line(tmp_path) -> None:
     store = toy_store(tmp_path, frames=12)
     trainer = trainer_for(store, workers=2, steps=30)

@@ -43,7 +43,7 @@ def test_joint_weight_targets(target, last):
 
 
 def test_unknown_joint_target_is_refused():
-    with pytest.raises(ValueError, match=r"training.joint_target must be one of halves, parent, own, got 'both'"):
+    with pytest.raises(ValueError, match=r"training.joint_target: wanted one of halves, parent, own, got 'both'"):
         joint_weight_targets([-1], "both")
 
 

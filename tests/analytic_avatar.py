@@ -1,4 +1,4 @@
-"""Avatars without a network, for tests: their canonical shape and skinning weights are functions that a subclass gives."""
+"""Avatars without a network, for tests: a subclass defines the canonical shape and the skinning weights as functions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["AnalyticAvatar", "capsule"]
 
 
 def capsule(points: Tensor, start: tuple, end: tuple, radius: float) -> Tensor:
-    """Distance into a capsule, positive inside, metres."""
+    """Return the distance to the surface of a capsule, positive inside, metres."""
     start_t, end_t = points.new_tensor(start), points.new_tensor(end)
     along = end_t - start_t
     share = ((points - start_t) @ along / (along @ along)).clamp(0, 1)

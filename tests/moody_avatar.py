@@ -1,4 +1,4 @@
-"""An avatar that fails in some poses, for tests of what becomes of the rest."""
+"""An avatar that fails in some poses, for tests of the remaining frames."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from toy_avatar import ToyAvatar
 
 
 class MoodyAvatar(ToyAvatar):
-    """Bent by about 0.5 radians it has no surface; from 1.1 radians it takes its process along, as the system may."""
+    """Bent by about 0.5 radians it has no surface; beyond 1.1 radians it ends its process, like the out-of-memory killer."""
 
     def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor):
         samples = super().query(points, bone_transforms, pose)

@@ -1,4 +1,4 @@
-"""A chain of bones whose shape depends on the pose and whose skin is smooth over all of them, without a network."""
+"""A chain of bones with a pose-dependent shape and smooth skinning weights, without a network."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ToyCharacter(AnalyticAvatar):
 
 
 def wave(frames: int = 13, name: str = "wave", turn: float = 0.7, rate: float = FRAME_RATE) -> Motion:
-    """Return a wave through the chain, which turns about and travels; the last joint never moves."""
+    """Return a wave through the chain, which turns and travels; the last joint does not move."""
     time = np.arange(frames) / rate
     poses = np.zeros((frames, JOINTS, 3))
     poses[:, 0, 1] = 2.9 * np.sin(2 * time)
@@ -64,7 +64,7 @@ def wave(frames: int = 13, name: str = "wave", turn: float = 0.7, rate: float = 
 
 
 def stretched(motion: Motion, character: ToyCharacter, scale: float = 1.0) -> Clip:
-    """Return a clip whose fourth bone and those after it drift away as time goes on, and grow by `scale`."""
+    """Return a clip in which the bones from the fourth on drift away over time and grow by `scale`."""
     poses, translation = torch.from_numpy(motion.poses), torch.from_numpy(motion.translation)
     transforms = character.skeleton.to(torch.float64).posed_from_canonical(poses, translation).numpy().copy()
     share = np.linspace(0, 1, len(transforms))

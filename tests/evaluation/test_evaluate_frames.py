@@ -42,7 +42,7 @@ class Balls:
 
 
 class Clock:
-    """Stands for `time`: it goes on by what the ball says that it takes."""
+    """Replaces `time`: advances by the times that the ball reports."""
 
     now = 0.0
 
@@ -117,7 +117,7 @@ def test_points_without_correspondence_are_counted_and_outside():
     assert frame.iou_bbox == (distance[:2000] < 0.5).sum() / (distance[:2000] < 1.0).sum()
 
 
-def test_many_points_are_asked_for_in_parts(monkeypatch):
+def test_many_points_are_queried_in_parts(monkeypatch):
     whole = measure_frame(BallAvatar(radius=0.9), Balls(), 0)
     monkeypatch.setattr(module, "_POINTS_AT_ONCE", 1500)
     avatar = BallAvatar(radius=0.9)

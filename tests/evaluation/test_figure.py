@@ -1,4 +1,4 @@
-"""Which frames are drawn, and what is drawn of them."""
+"""Choice and drawing of the worst and best frames."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_neighbours_of_the_worst_frame_are_not_shown_again():
     assert names(best) == [("walk", 79), ("walk", 69), ("walk", 59)]
 
 
-def test_each_sequence_has_stretches_of_its_own():
+def test_each_sequence_has_its_own_stretches():
     frames = [frame("walk", t, 0.5) for t in range(40)] + [frame("jump", t, 0.4 + t) for t in range(8)]
     worst, best = choose_extremes(frames, 2)
     assert names(worst) == [("jump", 0), ("walk", 0)]
@@ -43,7 +43,7 @@ def test_few_frames_are_shown_once(count, wanted):
 
 
 class Capsule:
-    """Samples of the straight toy avatar's own surface, made longer by `longer` metres."""
+    """Samples of the surface of the straight toy avatar, longer by `longer` metres."""
 
     name, num_frames, num_points, num_uniform = "lie", 1, 2000, 2000
 

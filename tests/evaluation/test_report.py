@@ -35,7 +35,7 @@ EVALUATION = EvaluationReport(
 SETTINGS = {"seed": 3, "split": "ood", "ckpt": None, "data": {"name": "builtin"}}
 
 
-def test_table_reads_as_wanted():
+def test_text_of_the_table():
     assert (
         table(EVALUATION)
         == """\
@@ -53,7 +53,7 @@ bbox: the papers' cube; tight: the mesh's own box; worst: lowest surface IoU of 
     )
 
 
-def test_table_fits_100_columns_whatever_the_names():
+def test_table_fits_100_columns_with_any_names():
     long = replace(EVALUATION, frames=[replace(FRAME, sequence="a_very_long_name_of_a_sequence_" * 3)], subject="7" * 20)
     lines = table(long).splitlines()
     assert max(len(line) for line in lines) <= 100

@@ -1,4 +1,4 @@
-"""Learned skinning weights beside true ones."""
+"""Learned skinning weights compared with true ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_share_on_wrong_bones_is_what_would_have_to_be_moved():
     assert "4 vertices: 32.5 % on wrong bones" in weights_text(found)
 
 
-def test_the_avatar_is_asked_at_the_canonical_vertices():
+def test_weights_are_compared_at_the_canonical_vertices():
     vertices = np.arange(12.0).reshape(4, 3)
 
     def weights_at(points):

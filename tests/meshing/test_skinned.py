@@ -1,4 +1,4 @@
-"""The skinned surface: made once, on the level set in every pose, moved by the weights that it carries."""
+"""The skinned surface: made once, on the level set in every pose, moved by its weights."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ def test_another_mesh_is_moved_onto_the_level_set_first():
     np.testing.assert_allclose(radii(surface.canonical_vertices(twisted(1.0))), RADIUS + 0.01, atol=3e-4)
 
 
-def test_where_the_shape_ends_vertices_go_along_with_their_neighbours():
-    """In some pose half of a band around the body has no surface near; its vertices must not shoot out."""
+def test_where_the_shape_ends_vertices_follow_their_neighbours():
+    """In one pose half of a band around the body has no surface near it; its vertices must not jump out."""
 
     class Torn(Breathing):
         def canonical_logits(self, points_c: Tensor, pose: Tensor) -> Tensor:
@@ -99,7 +99,7 @@ def test_where_the_shape_ends_vertices_go_along_with_their_neighbours():
 
 
 def test_a_point_that_finds_another_surface_than_its_neighbours_does_not_jump():
-    """In some pose a hair-thin spike stands on the body, as what a normal meets across a crease."""
+    """In one pose a hair-thin spike stands on the body, like the surface that a normal meets across a crease."""
 
     class Spiked(Breathing):
         def canonical_logits(self, points_c: Tensor, pose: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ def test_a_shape_that_vanishes_is_reported():
         surface.posed(twisted(0.6))
 
 
-def test_bad_poses_are_refused():
+def test_bad_poses_are_rejected():
     surface = SkinnedSurface(ToyAvatar(), 32)
     with pytest.raises(ValueError, match=r"pose: wanted shape \[J, 3\], got \[1, 2, 3\]"):
         surface.posed(twisted(0.0)[None])

@@ -86,7 +86,7 @@ def test_labels_of_an_open_mesh_are_exact(posed) -> None:
 
 
 def test_points_almost_on_the_surface_are_labelled_exactly(posed) -> None:
-    """The fast sum is at its worst there, and rounds to the right side all the same."""
+    """The error of the fast sum is largest there, but it still rounds to the correct side."""
     vertices, faces = posed["squats"]
     generator = np.random.default_rng(1)
     points = uniform_surface_samples(vertices, faces, 4000, generator)

@@ -89,7 +89,7 @@ def test_boundary_edges_of_one_missing_triangle() -> None:
     assert count_boundary_edges(np.concatenate([faces[1:], faces[:1, ::-1]])) == 3  # turned over is not closed either
 
 
-def test_unusable_meshes_are_refused() -> None:
+def test_unusable_meshes_are_rejected() -> None:
     vertices, faces = capsule_mesh(0.0, 1.0)
     broken = vertices.copy()
     broken[3, 1] = np.nan

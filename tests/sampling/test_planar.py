@@ -72,7 +72,7 @@ def test_frame_lies_exactly_on_the_plane() -> None:
 
 
 def test_spatial_frames_are_as_before() -> None:
-    """The random numbers of a frame do not depend on there being planar ones."""
+    """Planar subjects have not changed the random numbers of spatial ones."""
     vertices, faces = capsule_mesh(0.8, 0.1)
     samples = sample_frame(vertices, faces, replace(_SETTINGS, is_planar=False), frame_generator(0, "a", 0))
     uniform = frame_generator(0, "a", 0).random((2000, 3))

@@ -1,4 +1,4 @@
-"""Where the points of a frame lie, and that their labels are those of the stored points."""
+"""Positions of the points of a frame, and labels of exactly the stored points."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_missing_samples_are_drawn_from_the_faces(monkeypatch: pytest.MonkeyPatc
     assert abs((points[:, 0] < 0.25).mean() - 0.5) < 0.03
 
 
-def test_a_surface_without_area_is_refused() -> None:
+def test_a_surface_without_area_is_rejected() -> None:
     with pytest.raises(UserError, match="no area"):
         surface_samples(np.zeros((3, 3)), np.array([[0, 1, 2]]), 10, np.random.default_rng(0))
     for height in (1e-18, 1e-160):  # MeshLab would go on for ever
@@ -184,6 +184,6 @@ def test_generator_depends_on_every_name() -> None:
         ({"inside_test": "windin"}, "did you mean 'winding'"),
     ],
 )
-def test_settings_that_cannot_be_used_are_refused(change: dict, message: str) -> None:
+def test_settings_that_cannot_be_used_are_rejected(change: dict, message: str) -> None:
     with pytest.raises(UserError, match=message):
         replace(_SETTINGS, **change)

@@ -1,4 +1,4 @@
-"""What a canonical point is told of the pose."""
+"""Pose conditions of canonical points."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_bones_see_the_joints_at_their_ends():
         assert (seen[bone].nonzero()[:, 0] + 1).tolist() == joints
 
 
-def test_who_sees_all_is_told_all():
+def test_a_point_that_sees_all_parts_has_the_global_condition():
     random = torch.Generator().manual_seed(1)
     points, condition = torch.rand(30, 3, generator=random).double(), torch.randn(3, 12, generator=random).double()
     pose = torch.randint(3, (30,), generator=random)
@@ -37,7 +37,7 @@ def test_who_sees_all_is_told_all():
     torch.testing.assert_close(shape(points, condition, pose, torch.ones(30, 4).double()), shape(points, condition, pose))
 
 
-def test_a_point_depends_on_what_it_sees_alone():
+def test_a_point_depends_only_on_the_parts_that_it_sees():
     random = torch.Generator().manual_seed(2)
     points, condition = torch.rand(20, 3, generator=random).double(), torch.randn(1, 12, generator=random).double()
     weights = torch.nn.functional.one_hot(torch.arange(20) % 5, 5).double()

@@ -83,7 +83,7 @@ def test_a_point_does_not_depend_on_the_others(count):
 
 
 def test_far_steep_and_broken_points():
-    """Where the softplus is a line or flat, far away, and at NaN, which must not pass for a number."""
+    """Points where the softplus is linear or flat, far points, and NaN, which must stay NaN."""
     network = network_of(PAPER)
     points = torch.tensor([[30.0, -40, 50], [1e-6, 0, 0], [float("nan"), 0, 0], [0.2, float("inf"), 0]])
     condition, pose = torch.zeros(1, 3 * PARTS), torch.zeros(4, dtype=torch.long)
@@ -95,7 +95,7 @@ def test_far_steep_and_broken_points():
 
 
 def test_waves_of_large_angles():
-    """The encoding alone: sines and cosines in every quarter of the circle, both ways round."""
+    """The encoding only: sines and cosines of positive and negative angles in each quadrant."""
     config = replace(SMALL, width=1, depth=1, frequencies=[1.0], condition_layer=None, prior_radius_m=None, weight_norm=False)
     angles = torch.linspace(-60, 60, 4001)
     points = torch.stack([angles, 0.1 + 0 * angles, 0 * angles], 1)
@@ -112,7 +112,7 @@ def test_waves_of_large_angles():
         torch.testing.assert_close(got.double(), wanted, rtol=0, atol=4e-7)  # 2 is added and taken away in float32
 
 
-def test_where_it_stands_back():
+def test_conditions_for_the_native_evaluation():
     network, points = network_of(SMALL), torch.zeros(1, 3)
     assert not can_evaluate(network, points)  # gradients are wanted
     with torch.no_grad():
@@ -123,7 +123,7 @@ def test_where_it_stands_back():
 
 @pytest.mark.parametrize("name", ["avx2", "baseline"])
 def test_other_instruction_sets(name):
-    """The library chooses once a process, so these run in others."""
+    """The library chooses once per process, so these run in other processes."""
     there = build_note().get("instruction_sets", [])
     if name not in there:
         pytest.skip(f"this library is built for {', '.join(there) or 'nothing that it tells'} only")

@@ -1,4 +1,4 @@
-"""The canonical occupancy network: its parts, its beginning and its gradient."""
+"""The canonical occupancy network: its parts, initialisation and gradient."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_prior_starts_as_capsules():
     assert not bool(inside[distance > 0.08].any())
 
 
-def test_pose_has_no_influence_at_the_start_if_told_so():
+def test_pose_has_no_influence_at_the_start_if_switched_off():
     torch.manual_seed(0)
     config = ShapeConfig(**SMALL, condition_at_start=False, geometric_init=False, weight_norm=False)
     network = OccupancyNetwork(config, 6, BONES)

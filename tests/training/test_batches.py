@@ -1,4 +1,4 @@
-"""What a training step sees besides the stored points."""
+"""Points of a training step besides the stored ones."""
 
 from __future__ import annotations
 

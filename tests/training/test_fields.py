@@ -1,4 +1,4 @@
-"""`snarf train` with each weight field on the bending capsule, from the settings to the avatar that is used."""
+"""`snarf train` with each weight field on the bending capsule, from settings to a usable avatar."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_cells_follow_the_learned_shape(config_for, store):
     [
         ({"name": "mesh"}, "skinning.name: wanted distilled, voxel, mlp or preset, got 'mesh'"),
         ({"softmax": "flat"}, "skinning.softmax: wanted plain or hierarchical, got 'flat'"),
-        ({"name": "mlp"}, "skinning=mlp has no cells to search"),
+        ({"name": "mlp"}, "search: wanted snarf or broyden with skinning=mlp, got complete"),
         ({"name": "preset"}, "skinning=preset needs skinning.weights_file=FILE"),
         ({"name": "preset", "weights_file": "nowhere.npz"}, "no weights file at nowhere.npz"),
         ({"weights_file": "some.npz"}, "skinning.weights_file is for skinning=preset"),

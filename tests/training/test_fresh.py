@@ -1,4 +1,4 @@
-"""Fresh points: the same whoever draws them, labelled exactly, good to learn from; and nothing left of the processes."""
+"""Fresh points: equal in every process, labelled exactly, fit for training; no process is left afterwards."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def same(a, b) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("points", "occupied", "bone_transforms", "pose"))
 
 
-def test_a_step_is_the_same_whoever_draws_it(store) -> None:
+def test_a_step_is_the_same_in_every_process(store) -> None:
     here = batches_for(store, 0)
     expected = [here.batch(step) for step in range(9)]
     assert not same(expected[0], expected[1])

@@ -42,7 +42,7 @@ def test_joint_weight_targets(target, last):
     assert wanted.sum(1).tolist() == [1.0] * 3
 
 
-def test_unknown_joint_target_is_refused():
+def test_unknown_joint_target_is_rejected():
     with pytest.raises(ValueError, match=r"training.joint_target: wanted one of halves, parent, own, got 'both'"):
         joint_weight_targets([-1], "both")
 

@@ -1,4 +1,4 @@
-"""Results made ahead of time: their order, failures, and that no process is left."""
+"""Results made ahead of time: order, failures, and no process left."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _count(fail_at: int, first: int, stride: int) -> Iterator[int]:
         yield number
 
 
-def test_results_come_in_order_and_a_lost_process_is_told() -> None:
+def test_results_come_in_order_and_a_lost_process_is_reported() -> None:
     ahead = Prefetch(_count, (7,), 3, "training.workers=1")
     assert [ahead.get(number) for number in range(1, 7)] == [1, 2, 3, 4, 5, 6]
     with pytest.raises(UserError, match=r"worker process ended early \(exit code 9\).*training.workers=1"):

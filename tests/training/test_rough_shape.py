@@ -1,4 +1,4 @@
-"""Where a subject lies, judged before anything is learned."""
+"""The rough canonical shape of a subject before training."""
 
 from __future__ import annotations
 

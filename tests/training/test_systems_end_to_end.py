@@ -1,4 +1,4 @@
-"""`snarf train`, `eval` and `animate` with every system on the bending capsule; what ends a training early."""
+"""`snarf train`, `eval` and `animate` with every system on the bending capsule; trainings that end early."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_every_system_trains_evaluates_and_moves(config_for, name, tmp_path):
 
 
 @pytest.mark.parametrize("name", [name for name, system in SYSTEMS.items() if system.needs_template])
-def test_systems_that_need_true_weights_refuse_samples_without(config_for, name, monkeypatch):
+def test_systems_that_need_true_weights_reject_samples_without(config_for, name, monkeypatch):
     opened = SampleStore.open
 
     def without_template(*arguments):
@@ -115,14 +115,14 @@ def test_systems_that_need_true_weights_refuse_samples_without(config_for, name,
 
 def test_fields_of_the_grid_are_for_fast_snarf(config_for):
     config = config_for("back_lbs")
-    with pytest.raises(UserError, match="skinning=voxel is for model=fast_snarf; model back_lbs has weights of its own"):
+    with pytest.raises(UserError, match="skinning=voxel is for model=fast_snarf, got model=back_lbs; leave skinning out"):
         run(replace(config, skinning=replace(config.skinning, name="voxel")))
     assert not Path(config.output_root).exists()
 
 
-def test_settings_of_a_system_that_cannot_be_used_are_refused(config_for):
+def test_settings_of_a_system_that_cannot_be_used_are_rejected(config_for):
     config = config_for("snarf")
-    with pytest.raises(UserError, match="model=snarf has no cells to search; leave search out"):
+    with pytest.raises(UserError, match="search: wanted snarf or broyden with model=snarf, got complete"):
         run(replace(config, search=SearchConfig("complete")))
     for name, value in (("part_points", 0), ("part_width", 0), ("part_code", -1), ("part_weight", math.nan)):
         with pytest.raises(UserError, match=f"model.{name}: wanted at least"):

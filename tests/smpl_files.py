@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse
@@ -120,7 +120,7 @@ def pickled(arrays: dict[str, Any], *, chumpy: tuple[str, ...] = ("shapedirs",),
 class _Python2Pickler(pickle._Pickler):
     """Writes text and bytes as Python 2 wrote its strings."""
 
-    dispatch = dict(pickle._Pickler.dispatch)
+    dispatch: ClassVar = dict(pickle._Pickler.dispatch)
 
     def save_string(self, text: str | bytes) -> None:
         content = text.encode("latin1") if isinstance(text, str) else text

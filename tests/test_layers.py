@@ -1,4 +1,4 @@
-"""The layers of the package: a room imports only rooms of lower layers, and no import circle is left."""
+"""The layers of the package: a room imports only rooms of lower layers, and there are no circular imports."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ LAYERS = (
     ),
     ("errors", "names", "versions"),
 )
-"""Folders and top-level modules of the package, from the top; those of one layer do not know each other."""
+"""Folders and top-level modules of the package, from the top layer down; those of one layer do not import each other."""
 
 HEIGHT = {room: len(LAYERS) - level for level, rooms in enumerate(LAYERS) for room in rooms}
 
 
 def modules() -> dict[str, Path]:
-    """Return the files of the package by the names of their modules, without the package's own."""
+    """Return the file of each module, by module name; the package's own `__init__` and `__main__` are left out."""
     paths = {path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", "."): path for path in PACKAGE.rglob("*.py")}
     return {name.removesuffix(".__init__"): path for name, path in paths.items() if name not in ("__init__", "__main__")}
 
 
 def imported(path: Path, known: dict[str, Path]) -> Iterator[str]:
-    """Yield what of the package a file imports, wherever in the file it does so."""
+    """Yield the modules of the package that a file imports, also inside functions."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("snarfcli."):
             base = (node.module or "").removeprefix("snarfcli.")
@@ -83,7 +83,7 @@ def test_there_is_no_circle():
     known = modules()
     graph = {module: {other for other in imported(path, known) if other != module} for module, path in known.items()}
     for package in [name for name in known if known[name].name == "__init__.py"]:
-        graph[package] = set()  # it re-exports its own modules, which may name it
+        graph[package] = set()  # it re-exports its own modules, which may import it
     assert len(list(TopologicalSorter(graph).static_order())) == len(known)
 
 

@@ -1,1 +1,1 @@
-"""The avatar in the browser: what is shown is decided here, viser only shows it."""
+"""View an avatar in the browser with viser."""

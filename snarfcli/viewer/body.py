@@ -1,10 +1,9 @@
-"""The surfaces of an avatar as the viewer asks for them: those that are made at once, and those that take a while."""
+"""Requests for surfaces of an avatar, and their results."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.meshing.surfaces import field_surface
+from snarfcli.models.trained_field import TrainedField
 
 __all__ = [
     "CanonicalRequest",
@@ -30,10 +30,10 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """One pose of the avatar."""
+    """A pose of the avatar."""
 
     number: int
-    """Grows with every change, so that two poses of the same number are the same."""
+    """Counts changes of the pose; equal numbers mean equal poses."""
     pose: NDArray[np.float64]
     """[J, 3] axis-angle, radians, global orientation included."""
     translation: NDArray[np.float64]
@@ -44,7 +44,7 @@ class Posed:
 
 @dataclass(frozen=True, eq=False)
 class CanonicalRequest:
-    """Ask for the canonical surface."""
+    """A request for the canonical surface."""
 
     resolution: int
     """Voxels along the longest side of the canonical box."""
@@ -52,16 +52,17 @@ class CanonicalRequest:
 
 @dataclass(frozen=True, eq=False)
 class CanonicalResult:
-    """The canonical surface, which every pose is made from."""
+    """The canonical surface, from which all skinned surfaces are computed."""
 
     resolution: int
     surface: SkinnedSurface
     seconds: float
+    """Time that it took to compute."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeRequest:
-    """Ask how the canonical shape is in one pose."""
+    """A request for the canonical shape of a pose."""
 
     posed: Posed
     canonical: CanonicalResult
@@ -69,7 +70,7 @@ class ShapeRequest:
 
 @dataclass(frozen=True, eq=False)
 class ShapeResult:
-    """The canonical shape in one pose."""
+    """The canonical shape of a pose."""
 
     posed: Posed
     canonical: CanonicalResult
@@ -80,18 +81,18 @@ class ShapeResult:
 
 @dataclass(frozen=True, eq=False)
 class FieldRequest:
-    """Ask for the surface of the field in one pose."""
+    """A request for the field surface of a pose."""
 
     posed: Posed
     resolution: int
     """Voxels along the longest side of the posed box."""
     weights_from: Mesh | None
-    """Canonical mesh that lends its weights; None where no weights are wanted."""
+    """Canonical mesh from which weights are copied; None for a surface without weights."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldResult:
-    """The surface of the field in one pose."""
+    """The field surface of a pose."""
 
     posed: Posed
     resolution: int
@@ -100,16 +101,16 @@ class FieldResult:
 
 
 class ViewerBody:
-    """An avatar, asked for surfaces.
+    """Computes the surfaces of an avatar.
 
     Args:
         avatar: gives the field, the weights and the skeleton.
     """
 
-    def __init__(self, avatar: Any) -> None:
+    def __init__(self, avatar: TrainedField) -> None:
         self.avatar = avatar
         self.skeleton = avatar.skeleton
-        self.has_weights: bool = avatar.has_skinning_weights
+        self.has_weights = avatar.has_skinning_weights
 
     def transforms(self, pose: NDArray[np.float64], translation: NDArray[np.float64]) -> Floats:
         """Return the bone transforms [J, 4, 4], canonical to posed, of a pose [J, 3] and a translation [3]."""
@@ -117,7 +118,7 @@ class ViewerBody:
         return self.avatar.bone_transforms(pose_t, torch.from_numpy(translation).float()[None])[0].cpu().numpy()
 
     def make(self, request: CanonicalRequest | ShapeRequest | FieldRequest) -> CanonicalResult | ShapeResult | FieldResult:
-        """Make what was asked for, which may take seconds.
+        """Compute the result of a request, which may take seconds.
 
         Raises:
             EmptySurface, FullSurface: there is no surface in this pose.

@@ -1,4 +1,4 @@
-"""Meshes with a colour at each vertex, as bytes of a small .glb: viser's own meshes have one colour only."""
+"""Meshes with a colour per vertex as .glb bytes: the mesh nodes of viser have one colour only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["colored_glb"]
 def colored_glb(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], colors: NDArray[np.uint8], opacity: float = 1.0
 ) -> bytes:
-    """Return a binary glTF of one mesh; whoever draws it finds the normals.
+    """Return a binary glTF of one mesh without normals, which the browser computes.
 
     Args:
         vertices: [V, 3].
@@ -22,7 +22,7 @@ def colored_glb(
         colors: [V, 3] sRGB.
         opacity: 0 to 1.
     """
-    rgba = np.full((len(vertices), 4), 65535, dtype=np.uint16)  # not 8 bits: linear colours, as glTF has them, are dark
+    rgba = np.full((len(vertices), 4), 65535, dtype=np.uint16)  # 8 bits are too few for dark linear colours
     rgba[:, :3] = np.rint(65535 * from_srgb(colors))
     builder = GlbBuilder()
     attributes = {

@@ -1,4 +1,4 @@
-"""The panel of the page: pose, motion and look; it says what is shown and passes on what is chosen."""
+"""The panel of the page: tabs for motion, pose and look, and a status text."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from snarfcli.viewer.state import ViewerState
 __all__ = ["Controls"]
 
 _TEXT_EVERY_S = 0.25
-_MEASURED, _MEASURED_S = 31, 6.0  # frames and seconds that the rate is measured over
+_MEASURED, _MEASURED_S = 31, 6.0  # frames and seconds over which the frame rate is measured
 
 
 class Controls:
-    """The panel that all who look see.
+    """The panel, shared by all clients.
 
     Args:
-        server: viser's.
-        state: what is shown.
-        scene: where it is shown.
+        server: server of viser.
+        state: state of the viewer.
+        scene: scene of the viewer.
         motions: names of the motions that can be played.
         load_motion: returns the motion of a name and its bone transforms; raises UserError.
-        facts: what is told about the avatar, name and value.
-        first_motion: name of the motion that is loaded already.
-        clock: seconds.
+        facts: names and values for the tab about the avatar.
+        first_motion: name of the motion that is already loaded.
+        clock: returns the time, seconds.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Controls:
         self._facts = facts
         self._clock = clock
         self._next_text = 0.0
-        self._changes: list[float] = []  # when another pose was shown, of late
+        self._changes: list[float] = []  # times of recent changes of the shown pose
         self._shown_pose = -1
         gui.configure_theme(control_width="medium", show_share_button=False, show_logo=False)
         gui.set_panel_label("snarf view")
@@ -65,7 +65,7 @@ class Controls:
             gui.add_markdown(f"| | |\n|---|---|\n{rows}")
 
     def follow(self, picture: Picture) -> float | None:
-        """Bring sliders and text up to date; return for how many seconds nothing more has to be said."""
+        """Update sliders and text; return the seconds until the text must be updated again, None for no update."""
         now = self._clock()
         if picture.shown.number != self._shown_pose:
             self._shown_pose = picture.shown.number
@@ -82,8 +82,8 @@ class Controls:
         return _TEXT_EVERY_S if self._changes else None
 
     def _status(self, picture: Picture, now: float) -> str:
-        """Return what is shown, how fast, and what went wrong, as Markdown."""
-        self._changes = [time for time in self._changes[-_MEASURED:] if time > now - _MEASURED_S]
+        """Return the status as Markdown: surface, frame rate and errors."""
+        self._changes = [changed for changed in self._changes[-_MEASURED:] if changed > now - _MEASURED_S]
         spans = len(self._changes) - 1
         rate = spans / max(self._changes[-1] - self._changes[0], 1e-3) if spans > 0 else 0.0
         title = " · ".join(value for name, value in self._facts.items() if name in ("subject", "data", "model"))
@@ -91,12 +91,12 @@ class Controls:
         parts = ["no surface yet"] if mesh is None else [mesh.surface, f"{len(mesh.vertices):,} vertices"]
         times = []
         if picture.is_playing:
-            times.append(f"{rate:.{0 if rate >= 10 else 1}f} frames a second")
+            times.append(f"{rate:.{0 if rate >= 10 else 1}f} frames per second")
         elif picture.is_computing:
             times.append("computing …")
         if mesh is not None and mesh.seconds is not None:
-            times.append(f"{'made' if mesh.surface == 'field' else 'shape'} in {mesh.seconds:.2f} s")
-        # always so many lines: what is below must not jump
+            times.append(f"{'surface' if mesh.surface == 'field' else 'shape'} in {mesh.seconds:.2f} s")
+        # a constant number of lines, so that the panel below does not jump
         lines = [f"**{title}**", " · ".join(parts), " · ".join(times) or "&nbsp;"]
         lines += [f"⚠ {text}" for text in (self.motion.notice, picture.message) if text]
         return "  \n".join(lines)

@@ -1,4 +1,4 @@
-"""Inputs of the panel: which changes count, and three sliders that are one rotation."""
+"""Inputs of the panel: changes by users, and three sliders for one rotation."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from snarfcli.viewer.joints import ANGLE_LIMITS_DEG, angles_of, vector_of
 __all__ = ["AngleSliders", "on_user", "rounded"]
 
 _AXES = (("x", "to the left"), ("y", "up"), ("z", "to the front"))
-_SAME_RAD = 1e-6  # a pose and its angles, in double precision
+_SAME_RAD = 1e-6  # largest difference between a pose and its angles, in double precision
 
 
 class AngleSliders:
-    """Three sliders that turn a joint about its parent's axes.
+    """Three sliders that rotate a joint about the axes of its parent.
 
-    While a motion plays the sliders stand still: what they show is the pose of some frame before.
+    The sliders are not updated while a motion plays: they show the pose of an earlier frame.
 
     Args:
-        gui: viser's.
-        pose_of: holds the motion and returns the rotation vector [3] that the joint has then, radians.
-        turn: called with the rotation vector that somebody chose.
+        gui: GUI of viser.
+        pose_of: pauses the motion and returns the rotation vector [3] of the joint, radians.
+        turn: called with the rotation vector that a user chose.
     """
 
     def __init__(
@@ -34,8 +34,8 @@ class AngleSliders:
     ) -> None:
         self._pose_of = pose_of
         self._turn = turn
-        self._angles = (0.0, 0.0, 0.0)  # degrees, what was chosen or shown last: the sliders round it
-        self._one_by_one = threading.Lock()  # changes come from several threads
+        self._angles = (0.0, 0.0, 0.0)  # degrees, last chosen or shown, not rounded as in the sliders
+        self._lock = threading.Lock()  # changes come from several threads
         self.sliders = [
             gui.add_slider(f"turn {axis}", -limit, limit, 0.1, 0.0, hint=f"degrees about the parent's {axis} axis, {way}")
             for (axis, way), limit in zip(_AXES, ANGLE_LIMITS_DEG, strict=True)
@@ -50,27 +50,28 @@ class AngleSliders:
             slider.value = rounded(angle, 1)
 
     def _change(self, number: int) -> None:
-        """Turn the joint about the axis whose slider was moved; the other two angles stay those of its pose."""
-        with self._one_by_one:
+        """Rotate the joint about the axis of the moved slider; the other two angles stay those of its pose."""
+        with self._lock:
             angles = list(self._angles_for(self._pose_of()))
             angles[number] = self.sliders[number].value
-            self._angles = tuple(angles)
-            self._turn(vector_of(np.array(angles)))
+            x, y, z = angles
+            self._angles = (x, y, z)
+            self._turn(vector_of(self._angles))
 
     def _angles_for(self, vector: NDArray[np.float64]) -> tuple[float, float, float]:
-        """Return the angles of a rotation, those at hand if they stand for it: other ones might mean the same."""
-        stand = Rotation.from_rotvec(vector_of(np.array(self._angles)))
-        is_same = (stand.inv() * Rotation.from_rotvec(vector)).magnitude() < _SAME_RAD
+        """Return the angles of a rotation; the current ones if they are equivalent, since several triples may be."""
+        current = Rotation.from_rotvec(vector_of(np.array(self._angles)))
+        is_same = (current.inv() * Rotation.from_rotvec(vector)).magnitude() < _SAME_RAD
         return self._angles if is_same else angles_of(vector)
 
 
 def rounded(number: float, digits: int) -> float:
-    """Return a number as sliders show it; without the sign of a rounded zero."""
+    """Return a rounded number for a slider, without negative zero."""
     return round(float(number), digits) + 0.0
 
 
 def on_user(handle: Any, react: Callable[[Any, Any], None]) -> None:
-    """Call `react` with the handle and the client when somebody changes an input; not when the program does."""
+    """Call `react` with the handle and the client when a user changes an input, but not when the program does."""
 
     def updated(event: Any) -> None:
         if event.client is not None:

@@ -1,4 +1,4 @@
-"""Joints as a person poses them: readable names by limb, three angles in degrees each, left and right mirrored."""
+"""Joints for posing by hand: labels by limb, three angles in degrees per joint, mirroring of left and right."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ __all__ = [
     "vector_of",
 ]
 
-# Order of turns: x first, then y, then z, each about the axes of the parent (Blender's "XYZ Euler"). With the middle angle
-# within a quarter turn every rotation has one set of angles, so these limits leave none out.
+# Order of rotations: x first, then y, then z, each about the axes of the parent ("XYZ Euler" in Blender). With the middle angle
+# within a quarter turn every rotation has one set of angles, so these limits exclude none.
 _ORDER = "xyz"
 ANGLE_LIMITS_DEG: tuple[float, float, float] = (180.0, 90.0, 180.0)
-"""Largest angle about x, y and z, degrees."""
+"""Maximum angle about x, y and z, degrees."""
 
 _SIDES = {"l": "left", "r": "right"}
 _LIMBS = (
@@ -44,7 +44,7 @@ _HEAD = ("neck", "head", "jaw", "l_eye", "r_eye")
 def angles_of(vector: NDArray[np.float64]) -> tuple[float, float, float]:
     """Return a rotation vector [3], radians, as angles in degrees about x, y and z."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # at a quarter turn about y one of many triples is as good as another
+        warnings.simplefilter("ignore", UserWarning)  # at a quarter turn about y many triples are equivalent
         x, y, z = Rotation.from_rotvec(vector).as_euler(_ORDER, degrees=True)
     return float(x), float(y), float(z)
 
@@ -55,7 +55,7 @@ def vector_of(angles: tuple[float, float, float] | NDArray[np.float64]) -> NDArr
 
 
 def joint_labels(skeleton: Skeleton) -> dict[str, int]:
-    """Return a label for each joint but the root, limb by limb: `left arm: elbow`, `trunk: spine2`, `Tail_03`."""
+    """Return a label for each joint except the root, ordered by limbs: `left arm: elbow`, `trunk: spine2`, `Tail_03`."""
     parts = find_body_parts(skeleton.names, skeleton.parents)
     parts_of = {joint: part for part, joint in parts.joints.items()}
     limbs: dict[str, list[int]] = {}
@@ -72,7 +72,7 @@ def joint_labels(skeleton: Skeleton) -> dict[str, int]:
 
 
 def _limb_of(joint: int, part: str | None, spine: tuple[int, ...]) -> str:
-    """Return the limb that a joint belongs to; empty for one that is no known part of a human body."""
+    """Return the limb of a joint; empty if it is not a known part of a human body."""
     if joint in spine or part == "pelvis":
         return "trunk"
     if part is None:
@@ -85,12 +85,12 @@ def _limb_of(joint: int, part: str | None, spine: tuple[int, ...]) -> str:
 
 
 def _without_side(name: str) -> str:
-    """Return a joint's name without the side, which the limb's name has already, where it stands in SMPL's way."""
+    """Return a joint name without the prefix for the side, as in SMPL, since the name of the limb has it already."""
     return name[2:] if name[:2] in ("l_", "r_") else name
 
 
 def mirrored_joint(skeleton: Skeleton, joint: int, vector: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
-    """Return the joint on the other side, and the rotation vector [3] that mirrors one of `joint` in the plane x = 0."""
+    """Return the joint on the other side, and a rotation vector [3] of `joint` mirrored in the plane x = 0."""
     return skeleton.left_right[joint], vector * (1.0, -1.0, -1.0)
 
 
@@ -103,7 +103,7 @@ def posed_joints(skeleton: Skeleton, transforms: NDArray[np.float32]) -> NDArray
 def pose_file(pose: NDArray[np.float64], translation: NDArray[np.float64]) -> bytes:
     """Return one pose [J, 3] and its translation [3] as an .npz file that `--pose` reads, y up.
 
-    The file says so, since a reader would take the axis along which the body stands for the one that is up: here it may lie.
+    The file states the up axis, since readers would otherwise take the axis along which the body stands, and it may lie.
     """
     buffer = io.BytesIO()
     np.savez(buffer, poses=pose.reshape(1, -1), trans=translation.reshape(1, 3), mocap_framerate=30.0, up=np.array("y"))
@@ -111,12 +111,12 @@ def pose_file(pose: NDArray[np.float64], translation: NDArray[np.float64]) -> by
 
 
 def global_turns(skeleton: Skeleton, transforms: NDArray[np.float32]) -> Rotation:
-    """Return the rotations of the J joints from the rest pose under bone transforms [J, 4, 4], canonical to posed."""
+    """Return the rotations of the J joints from the rest pose, given bone transforms [J, 4, 4], canonical to posed."""
     canonical_from_rest = skeleton.posed_from_rest(skeleton.canonical_pose[None])[0, :, :3, :3].cpu().numpy()
     return Rotation.from_matrix(transforms[:, :3, :3].astype(np.float64) @ canonical_from_rest)
 
 
 def vector_from_turn(skeleton: Skeleton, transforms: NDArray[np.float32], joint: int, turn: Rotation) -> NDArray[np.float64]:
-    """Return the rotation vector [3] relative to its parent that gives a joint the rotation `turn` from the rest pose."""
+    """Return the rotation vector [3], relative to its parent, of a joint with the rotation `turn` from the rest pose."""
     parent = skeleton.parents[joint]
     return (turn if parent < 0 else global_turns(skeleton, transforms)[parent].inv() * turn).as_rotvec()

@@ -1,4 +1,4 @@
-"""The tab of the look: which surface is shown, how finely, and what stands beside it."""
+"""The tab of the look: surface, resolution, colours and what is shown beside it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ __all__ = ["LookTab"]
 
 
 class LookTab:
-    """The inputs of the look, made where viser's next ones go.
+    """The inputs of the look, added to the current container of viser.
 
     Args:
-        gui: viser's.
-        state: what is shown.
-        scene: where it is shown.
+        gui: GUI of viser.
+        state: state of the viewer.
+        scene: scene of the viewer.
     """
 
     def __init__(self, gui: Any, state: ViewerState, scene: ViewerScene) -> None:

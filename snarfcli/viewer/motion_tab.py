@@ -1,11 +1,11 @@
-"""The tab of motions: which one is played, how, and which frame is seen."""
+"""The tab of motions: motion, frame, speed and loop."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, one_line
 from snarfcli.viewer.inputs import on_user
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.state import ViewerState
@@ -17,14 +17,14 @@ _SPEEDS = (0.1, 2.0)
 
 
 class MotionTab:
-    """The inputs of the motion, made where viser's next ones go.
+    """The inputs of the motion, added to the current container of viser.
 
     Args:
-        gui: viser's.
-        state: what is shown.
+        gui: GUI of viser.
+        state: state of the viewer.
         motions: names of the motions that can be played.
         load_motion: returns the motion of a name and its bone transforms; raises UserError.
-        first: name of the motion that is loaded already.
+        first: name of the motion that is already loaded.
     """
 
     def __init__(
@@ -39,11 +39,11 @@ class MotionTab:
         self._load_motion = load_motion
         self._is_playing: bool | None = None
         self.notice: str | None = None
-        """Why the motion that was chosen last cannot be played, in one line; None if it can."""
+        """Why the chosen motion cannot be played, in one line; None if it can."""
         self.names = gui.add_dropdown("Motion", (NO_MOTION, *motions), initial_value=first or NO_MOTION)
         self._play = gui.add_button("Play", icon="player-play")
         self._frame = gui.add_slider("Frame", 0, 1, 1, 0)
-        speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="times the motion's own pace")
+        speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="1 is the original speed")
         loop = gui.add_checkbox("Loop", state.player.is_looping)
         in_place = gui.add_checkbox(
             "Stay in place", state.look.is_in_place, hint="the body keeps its height, but does not travel"
@@ -57,19 +57,19 @@ class MotionTab:
         self._fit_frames()
 
     def choose(self, name: str) -> None:
-        """Play the motion of a name."""
+        """Load and play the motion with this name."""
         self.notice = None
         try:
             motion, transforms = (None, None) if name == NO_MOTION else self._load_motion(name)
         except UserError as error:
-            self.notice = " ".join(str(error).split())
+            self.notice = one_line(error)
             motion, transforms = None, None
         self._state.load_motion(motion, transforms)
         self._fit_frames()
         self._state.play()
 
     def follow(self, picture: Picture) -> None:
-        """Say on the button what it does."""
+        """Update the label of the play button."""
         if picture.is_playing != self._is_playing:
             self._is_playing = picture.is_playing
             self._play.label = "Pause" if picture.is_playing else "Play"
@@ -81,7 +81,7 @@ class MotionTab:
             self._frame.value = min(frame, int(self._frame.max))
 
     def _fit_frames(self) -> None:
-        """Give the frame's slider the length of the motion."""
+        """Set the range of the frame slider to the length of the motion."""
         count = self._state.player.num_frames
         self._frame.value = 0
         self._frame.max = max(count - 1, 1)

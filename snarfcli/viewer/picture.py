@@ -1,4 +1,4 @@
-"""What can be chosen about the picture, and what is to be seen at one moment."""
+"""The look chosen by the user, and the picture shown at one moment."""
 
 from __future__ import annotations
 
@@ -21,64 +21,64 @@ class ViewerLook:
     """How the avatar is shown."""
 
     surface: str = "skinned"
-    """skinned (the canonical mesh moved by its skin) or field (the union of all correspondences)."""
+    """skinned (the canonical mesh moved by linear blend skinning) or field (the union of all correspondences)."""
     skinned_resolution: int = 128
     """Voxels along the longest side of the canonical box."""
     field_resolution: int = 128
     """Voxels along the longest side of the posed box."""
     has_pose_shape: bool = True
-    """Whether the skinned surface takes the shape of the pose, or keeps that of the canonical pose."""
+    """Whether the skinned surface has the shape of the pose, or that of the canonical pose."""
     weight_colors: bool = False
     """Whether vertices are coloured by their skinning weights."""
     shows_canonical: bool = False
-    """Whether the canonical shape stands beside the posed one."""
+    """Whether the canonical shape is shown beside the posed one."""
     shows_skeleton: bool = False
     """Whether joints and bones are drawn."""
     is_in_place: bool = False
-    """Whether the body stays over one spot while it moves."""
+    """Whether the body moves in place, without horizontal translation."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShownMesh:
-    """The surface that is to be seen."""
+    """The surface to show."""
 
     surface: str
-    """Which kind it is: skinned or field."""
+    """Kind of surface: skinned or field."""
     posed: Posed
-    """The pose that it is in, which may be an earlier one than is wanted."""
+    """Its pose, which may be an earlier one than the current pose."""
     vertices: NDArray[np.float32]
     """[V, 3] metres."""
     faces: NDArray[np.int32]
-    """[F, 3]; the very same array as long as the triangles stay the same."""
+    """[F, 3]; the same array object while the triangles are the same."""
     weights: NDArray[np.float32] | None
-    """[V, J], where colours are wanted and there are weights."""
+    """[V, J] for colours; None without colours or weights."""
     seconds: float | None
-    """How long it, or the shape of its pose, took to make; None for what is made at once."""
+    """Time to compute it, or the shape of its pose; None if neither was computed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """All that is to be seen at one moment."""
+    """Everything shown at one moment."""
 
     look: ViewerLook
-    """How it is to be shown: the look that the rest was made for, while the one that is wanted may have changed since."""
+    """The look of this picture; the current look may have changed since."""
     floor_y: float
     """Height of the floor, metres."""
     posed: Posed
-    """The pose that is wanted."""
+    """The current pose."""
     mesh: ShownMesh | None
-    """The surface; None while there is none."""
+    """The surface; None until there is one."""
     canonical: Mesh | None
-    """The canonical shape, if it is to be shown."""
+    """The canonical shape, if it is shown."""
     frame: int
     """Number of the frame of the motion."""
     is_playing: bool
     is_computing: bool
-    """Whether the surface that is wanted is still being made."""
+    """Whether the surface of the current pose and look is still being computed."""
     message: str | None
-    """What went wrong, in one line; None if nothing did."""
+    """The latest error in one line; None if there is none."""
 
     @property
     def shown(self) -> Posed:
-        """The pose that is seen."""
+        """The pose of the shown surface."""
         return self.posed if self.mesh is None else self.mesh.posed

@@ -1,4 +1,4 @@
-"""Playing a motion: which frame is due at which time."""
+"""The playback position in a motion."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ __all__ = ["Player"]
 
 
 class Player:
-    """A position in a motion that runs with a clock, or stands.
+    """A position in a motion that advances with time, or is paused.
 
-    Time is whatever the caller's clock says, seconds; the player asks no clock itself.
+    The caller passes the time, `now` in seconds, to each method; the player has no clock.
     """
 
     def __init__(self) -> None:
@@ -23,13 +23,13 @@ class Player:
         self._since = 0.0
 
     def load(self, num_frames: int, frame_rate: float) -> None:
-        """Take another motion and stand at its first frame; one without frames is no motion."""
+        """Load another motion, paused at its first frame; 0 frames for no motion."""
         self.num_frames, self.frame_rate = num_frames, frame_rate
         self.is_playing = False
         self._position = 0.0
 
     def frame(self, now: float) -> int:
-        """Return the number of the frame that is due; stop at the last one unless looping."""
+        """Return the number of the current frame; stop at the last one unless looping."""
         position = self._at(now)
         if self.is_playing and not self.is_looping and position >= self.num_frames - 1:
             self._position, self.is_playing = float(max(self.num_frames - 1, 0)), False
@@ -37,7 +37,7 @@ class Player:
         return int(position + 1e-9)
 
     def play(self, now: float) -> None:
-        """Run from the present frame; from the first one if this is the end. A single frame does not run."""
+        """Play from the current frame, or from the first one if this is the last. A single frame is not played."""
         if self.num_frames < 2 or self.is_playing:
             return
         if not self.is_looping and self._position >= self.num_frames - 1:
@@ -45,24 +45,24 @@ class Player:
         self._since, self.is_playing = now, True
 
     def pause(self, now: float) -> None:
-        """Stand at the present frame."""
+        """Pause at the current frame."""
         self._position = float(self.frame(now))
         self.is_playing = False
 
     def seek(self, frame: int, now: float) -> None:
-        """Go to a frame; what ran goes on from there."""
+        """Go to a frame; a playing motion continues from there."""
         self._position, self._since = float(min(max(frame, 0), max(self.num_frames - 1, 0))), now
 
     def change_speed(self, speed: float, now: float) -> None:
-        """Run at so many times the motion's own pace from now on."""
+        """Set the speed; 1 is the original speed."""
         self._position, self._since, self.speed = self._at(now), now, speed
 
     def change_looping(self, is_looping: bool, now: float) -> None:
-        """Start again after the last frame, or stand there."""
+        """Set whether the motion restarts after its last frame, or stops there."""
         self._position, self._since, self.is_looping = self._at(now), now, is_looping
 
     def seconds_to_next(self, now: float) -> float | None:
-        """Return how long the present frame still is due; None while the player stands."""
+        """Return the seconds until the next frame; None while paused."""
         if not self.is_playing:
             return None
         position = self._at(now)

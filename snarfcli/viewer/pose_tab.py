@@ -1,4 +1,4 @@
-"""The tab of the pose: joint by joint, and the body as a whole."""
+"""The tab of the pose: single joints, and the whole body."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from snarfcli.viewer.state import ViewerState
 
 __all__ = ["PoseTab"]
 
-_REACH_M = 3.0  # of the slider for the height, about the body's size of a person
+_REACH_M = 3.0  # range of the height slider, about twice the height of a person
 
 
 class PoseTab:
-    """The inputs of the pose, made where viser's next ones go.
+    """The inputs of the pose, added to the current container of viser.
 
     Args:
-        gui: viser's.
-        state: what is shown.
-        scene: where it is shown, and the chosen joint is marked.
+        gui: GUI of viser.
+        state: state of the viewer.
+        scene: scene of the viewer, which marks the chosen joint.
     """
 
     def __init__(self, gui: Any, state: ViewerState, scene: ViewerScene) -> None:
@@ -32,12 +32,12 @@ class PoseTab:
         self._state = state
         self._scene = scene
         self._labels = joint_labels(state.body.skeleton)
-        self._seen_pose = -1  # which pose the sliders stand for
+        self._seen_pose = -1  # number of the pose that the sliders show
         with gui.add_folder("Joint", visible=bool(self._labels)):  # a skeleton of one joint has its root only
             joints = tuple(self._labels) or ("none",)
             self._joint = gui.add_dropdown("Joint", joints, hint="or click one in the picture (Look: skeleton)")
             self._angles = self._add_angles(lambda: self.joint)
-            buttons = gui.add_button_group("", ("Straight", "Mirror"), hint="mirror: turn the joint of the other side alike")
+            buttons = gui.add_button_group("", ("Straight", "Mirror"), hint="mirror: rotate the opposite joint alike")
         with gui.add_folder("Whole body"):
             self._turns = self._add_angles(lambda: 0)
             self._height = gui.add_slider("height", -_REACH_M, _REACH_M, 0.01, 0.0, hint="metres above its place at rest")
@@ -56,14 +56,14 @@ class PoseTab:
         return self._labels.get(self._joint.value, 0)
 
     def choose_joint(self, joint: int) -> None:
-        """Choose a joint by its number, as by a click; the root is always at hand."""
+        """Choose a joint by its number; the root, which always has its own sliders, is ignored."""
         label = next((label for label, number in self._labels.items() if number == joint), None)
         if label is not None:
             self._joint.value = label
             self._mark_joint()
 
     def follow(self, picture: Picture) -> bool:
-        """Bring the sliders up to date, which rest while a motion plays; return whether there was another pose."""
+        """Update the sliders, unless a motion plays; return whether the pose has changed."""
         if picture.is_playing or picture.posed.number == self._seen_pose:
             return False
         self._seen_pose = picture.posed.number

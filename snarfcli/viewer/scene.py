@@ -1,9 +1,10 @@
-"""What stands on viser's stage: the avatar, its canonical shape, the skeleton, the floor, and the camera before them."""
+"""The 3D scene of the page: avatar, canonical shape, skeleton, floor and camera."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,23 +19,33 @@ from snarfcli.viewer.surfaces import ShownSurface
 __all__ = ["BODY_COLOR", "ViewerScene"]
 
 BODY_COLOR = (205, 184, 168)
-"""Of the body, sRGB: clay, on which light and shade are seen well."""
+"""Colour of the body, sRGB: clay, on which shading is well visible."""
 
 _BONE, _JOINT, _CHOSEN = (70, 80, 95), (255, 214, 102), (235, 94, 40)  # sRGB
-_SEE_THROUGH = 0.45  # opacity of a body whose skeleton is to be seen inside of it
+_SEE_THROUGH = 0.45  # opacity of a body with a visible skeleton
 _FIELD_OF_VIEW_RAD = 0.6
 _ROOM, _ROOM_ASIDE = 0.74, 0.46  # half the height of the picture over the size of one body, and over the width of two
-_PANEL = 0.3  # how far the middle is shifted for the panel, which covers the right side
+_PANEL = 0.3  # shift of the middle for the panel, which covers the right side
+
+
+@dataclass(frozen=True, eq=False)
+class _SkeletonNodes:
+    """Nodes of viser for the skeleton."""
+
+    joints: Any
+    bones: Any
+    """None for a single joint."""
+    handle: Any
 
 
 class ViewerScene:
-    """The stage that all who look see.
+    """The scene, shared by all clients.
 
     Args:
-        server: viser's.
-        state: what is shown.
-        choose_joint: called with the number of a joint that somebody clicked.
-        clock: seconds.
+        server: server of viser.
+        state: state of the viewer.
+        choose_joint: called with the number of a joint that a user clicked.
+        clock: returns the time, seconds.
     """
 
     def __init__(
@@ -51,7 +62,7 @@ class ViewerScene:
         self.chosen_joint = 0
         self._shown: tuple | None = None
         self._picture: Picture | None = None
-        self._turning: set[int | None] = set()  # numbers of the clients that hold the handle
+        self._turning: set[int | None] = set()  # numbers of the clients that drag the handle
         rest = state.body.transforms(np.zeros((self._skeleton.num_joints, 3)), np.zeros(3))
         joints = posed_joints(self._skeleton, rest)
         self.size = float(max(np.ptp(joints, axis=0).max(), 0.1))
@@ -66,34 +77,32 @@ class ViewerScene:
         self._body = ShownSurface(server, "/avatar")
         self._canonical = ShownSurface(server, "/canonical")
         self._label = server.scene.add_label("/canonical_label", "canonical shape", visible=False)
-        self._bones: Any = None
-        self._joints: Any = None
-        self._handle: Any = None
+        self._skeleton_nodes: _SkeletonNodes | None = None  # created when the skeleton is shown first
         camera = server.initial_camera
         camera.up, camera.fov = np.array([0.0, 1.0, 0.0]), _FIELD_OF_VIEW_RAD
         camera.position, camera.look_at = self._camera(False)
 
     def frame_body(self, camera: Any) -> None:
-        """Put a camera so that it sees the body, and the canonical shape beside it."""
+        """Place a camera so that it sees the body, and the canonical shape beside it if it is shown."""
         position, look_at = self._camera(self._state.look.shows_canonical)
         camera.up_direction, camera.position, camera.look_at = (0.0, 1.0, 0.0), position, look_at
 
     def show(self, picture: Picture) -> None:
-        """Bring the stage up to date."""
+        """Update the scene."""
         with self._server.atomic():
             self._floor.position = (0.0, picture.floor_y, 0.0)
             mesh, mesh_c = picture.mesh, picture.canonical
-            made = () if mesh is None else (mesh.posed.number, mesh.surface, mesh.seconds, id(mesh.faces))
+            main = () if mesh is None else (mesh.posed.number, mesh.surface, mesh.seconds, id(mesh.faces))
             beside = () if mesh_c is None else (id(mesh_c.vertices), id(mesh_c.faces), picture.floor_y)
-            key = (made, beside, picture.look, self.body_color, self.is_wireframe)
+            key = (main, beside, picture.look, self.body_color, self.is_wireframe)
             if key != self._shown:
-                self._shown, self._picture = key, picture  # held, so that no other array gets the numbers of its arrays
+                self._shown, self._picture = key, picture  # kept, so that no new array gets the id of its arrays
                 self._show_surfaces(picture)
             self.advance()
             self._show_skeleton(self._body.seen or picture.shown, picture.look.shows_skeleton)
 
     def advance(self) -> float | None:
-        """Go on with what takes its time; return for how many seconds there is nothing to do, None for for ever."""
+        """Continue delayed updates; return the seconds until the next one, None if there is none."""
         now = self._clock()
         times = [due for due in (self._body.advance(now), self._canonical.advance(now)) if due is not None]
         return max(min(times) - now, 0.0) if times else None
@@ -122,63 +131,66 @@ class ViewerScene:
         self._label.visible = mesh_c is not None
 
     def _show_skeleton(self, shown: Posed, shows: bool) -> None:
-        if not shows and self._joints is None:
+        if not shows and self._skeleton_nodes is None:
             return
         joints = posed_joints(self._skeleton, shown.transforms)
-        if self._joints is None:
-            self._make_skeleton(joints)
-        self._joints.visible = shows
-        if self._bones is not None:
-            self._bones.visible = shows
-        self._handle.visible = shows and self.shows_handle
+        if self._skeleton_nodes is None:
+            self._skeleton_nodes = self._add_skeleton(joints)
+        nodes = self._skeleton_nodes
+        nodes.joints.visible = shows
+        if nodes.bones is not None:
+            nodes.bones.visible = shows
+        nodes.handle.visible = shows and self.shows_handle
         if not shows:
             return
-        self._joints.batched_positions = joints
+        nodes.joints.batched_positions = joints
         colors = np.full((len(joints), 3), _JOINT, dtype=np.uint8)
         colors[self.chosen_joint] = _CHOSEN
-        self._joints.batched_colors = colors
-        if self._bones is not None:
-            self._bones.points = joints[np.array(self._skeleton.bones)]
+        nodes.joints.batched_colors = colors
+        if nodes.bones is not None:
+            nodes.bones.points = joints[np.array(self._skeleton.bones)]
         if not self._turning:
-            self._handle.position = joints[self.chosen_joint]
+            nodes.handle.position = joints[self.chosen_joint]
             turn = global_turns(self._skeleton, shown.transforms)[self.chosen_joint]
-            self._handle.wxyz = turn.as_quat()[[3, 0, 1, 2]]
+            nodes.handle.wxyz = turn.as_quat()[[3, 0, 1, 2]]
 
-    def _make_skeleton(self, joints: np.ndarray) -> None:
+    def _add_skeleton(self, joints: np.ndarray) -> _SkeletonNodes:
         import trimesh
 
         ball = trimesh.creation.icosphere(subdivisions=2, radius=0.015 * self.size)
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(joints), 1))
-        self._joints = self._server.scene.add_batched_meshes_simple(
+        balls = self._server.scene.add_batched_meshes_simple(
             "/skeleton/joints", ball.vertices, ball.faces, turns, joints, lod="off", cast_shadow=False,
             batched_colors=np.full((len(joints), 3), _JOINT, dtype=np.uint8), receive_shadow=False,
         )  # fmt: skip
-        self._joints.on_click(lambda event: self._choose_joint(int(event.instance_index)))
+        balls.on_click(lambda event: self._choose_joint(int(event.instance_index)))
+        bones = None
         if self._skeleton.bones:
             ends = joints[np.array(self._skeleton.bones)]
-            self._bones = self._server.scene.add_line_segments("/skeleton/bones", ends, _BONE, thickness=0.007 * self.size)
-        self._handle = self._server.scene.add_transform_controls(
+            bones = self._server.scene.add_line_segments("/skeleton/bones", ends, _BONE, thickness=0.007 * self.size)
+        handle = self._server.scene.add_transform_controls(
             "/handle", scale=0.13 * self.size, disable_axes=True, disable_sliders=True, depth_test=False, visible=False
         )
-        self._handle.on_update(lambda event: self.turn_chosen(event.target.wxyz, event.phase == "end", event.client_id))
+        handle.on_update(lambda event: self.turn_chosen(event.target.wxyz, event.phase == "end", event.client_id))
+        return _SkeletonNodes(balls, bones, handle)
 
     def turn_chosen(self, wxyz: np.ndarray, is_over: bool, client_id: int | None) -> None:
-        """Turn the chosen joint as a client turned the handle, a quaternion; the handle is theirs until that is over."""
+        """Rotate the chosen joint as a client rotated the handle, a quaternion; the handle is not moved until this is over."""
         (self._turning.discard if is_over else self._turning.add)(client_id)
         turn = Rotation.from_quat(np.asarray(wxyz)[[1, 2, 3, 0]])
         vector = vector_from_turn(self._skeleton, self._state.pause().transforms, self.chosen_joint, turn)
         self._state.turn_joint(self.chosen_joint, vector)
 
     def let_go(self, client_id: int) -> None:
-        """Take the handle back from a client who left, maybe in the middle of a turn."""
+        """Release the handle of a client that has left, maybe while dragging it."""
         self._turning.discard(client_id)
 
     def _square(self) -> float:
-        """Return the width of a square of the floor: a metre for people, a power of ten that suits other sizes."""
+        """Return the width of a square of the floor, metres: 1 for the size of a person, else a power of ten."""
         return float(10.0 ** np.round(np.log10(self.size / 1.3)))
 
     def _camera(self, shows_canonical: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return where a camera stands and looks at, metres: in front of the body, somewhat to its left."""
+        """Return position and target of a camera, metres: in front of the body, slightly to its left."""
         joints = posed_joints(self._skeleton, self._state.posed.transforms)
         floor_y, half = self._state.floor_y, self.size / 2
         middle = np.array([joints[:, 0].mean(), floor_y + 1.12 * half, joints[:, 2].mean()])

@@ -1,4 +1,4 @@
-"""The page's server: where it listens, and the thread that keeps the page up to date."""
+"""The server of the page: its address, and the thread that updates the page."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from snarfcli.errors import UserError
+from snarfcli.models.trained_field import TrainedField
 from snarfcli.viewer.body import ViewerBody
 from snarfcli.viewer.controls import Controls
 from snarfcli.viewer.picture import ViewerLook
@@ -25,23 +26,23 @@ __all__ = ["ViewServer", "can_open_browser", "check_port", "is_loopback", "requi
 log = logging.getLogger(__name__)
 
 _TRIED_PORTS = 100
-_SHORTEST_S = 1 / 60  # between two pictures
+_SHORTEST_S = 1 / 60  # minimum time between two pictures
 
 
 def require_viser() -> None:
-    """Refuse to go on without viser.
+    """Check that viser is installed.
 
     Raises:
-        UserError: it is not installed; says how to.
+        UserError: it is not; the message says how to install it.
     """
     try:
         import viser  # noqa: F401
     except ImportError as error:
-        raise UserError(f"the viewer needs viser ({error}); pip install 'snarf[view]'") from None
+        raise UserError(f"viewer: wanted viser, got {error}; pip install 'snarf[view]'") from None
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address."""
+    """Return whether an address can be reached from this machine only."""
     import ipaddress
 
     try:
@@ -51,29 +52,33 @@ def is_loopback(host: str) -> bool:
 
 
 def check_port(host: str, port: int) -> None:
-    """Make sure that a port can be listened at; 0 stands for any.
+    """Check that a server can listen at a port; 0 stands for any free one.
 
     Raises:
-        UserError: it is in use, or the host is none of this machine's; names the next free port.
+        UserError: it is in use, or the host is no address of this machine; the message names the next free port.
     """
     reason = _refusal(host, port)
     if reason is None:
         return
     if isinstance(reason, PermissionError):
-        raise UserError(f"port {port} is reserved for the administrator; give --port with a number above 1023")
+        raise UserError(f"port: wanted a number above 1023, got {port}, which is reserved for the system; give --port NUMBER")
     if port and not _is_address_fault(host):
         free = next((number for number in range(port + 1, min(port + _TRIED_PORTS, 65536)) if not _refusal(host, number)), 0)
-        raise UserError(f"port {port} is in use; port {free} is free: give --port {free}" if free else
-                        f"port {port} is in use; give --port auto for any free one")  # fmt: skip
-    raise UserError(f"host {host} is no address of this machine ({reason}); leave it out, or give host=0.0.0.0 for all")
+        raise UserError(_in_use(port, f"{free}" if free else "auto"))
+    raise UserError(f"host: wanted an address of this machine, got {host} ({reason}); give none, or host=0.0.0.0 for all")
+
+
+def _in_use(port: int, free: str) -> str:
+    """Return the message for a port that is in use, with a free one, or auto."""
+    return f"port: wanted a free one, got {port}, which is in use; give --port {free}"
 
 
 def _refusal(host: str, port: int) -> OSError | None:
-    """Return why nothing can listen there, None if something can."""
+    """Return the error of listening at an address, None if it is free."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         with socket.socket(family, kind) as listener:
-            if os.name == "posix":  # a port whose last user has just gone is free
+            if os.name == "posix":  # a port that was closed a moment ago is free
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(address)
             listener.listen(1)
@@ -87,24 +92,24 @@ def _is_address_fault(host: str) -> bool:
 
 
 def can_open_browser(environment: Mapping[str, str] = os.environ, platform: str = sys.platform) -> bool:
-    """Return whether a browser opened here would be seen by whoever typed the command: not over SSH, nor without a display."""
+    """Return whether a browser opened here is visible to the user: not over SSH, and not without a display."""
     if environment.get("SSH_CONNECTION") or environment.get("SSH_TTY"):
         return False
     return platform in ("win32", "darwin") or bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))
 
 
 class ViewServer:
-    """An avatar on a page; listens and draws from the moment it is made until `stop`.
+    """Shows an avatar on a page, from its construction until `stop`.
 
     Args:
-        avatar: who is shown.
-        look: how at first.
+        avatar: avatar to show.
+        look: initial look.
         host: address to listen at.
-        port: its port; 0 takes any free one.
+        port: port to listen at; 0 takes any free one.
         motions: names of the motions that can be played.
         load_motion: returns the motion of a name and its bone transforms; raises UserError.
-        facts: what is told about the avatar.
-        first_motion: name, motion and bone transforms of what is played at first; None for nothing.
+        facts: names and values for the tab about the avatar.
+        first_motion: name, motion and bone transforms of the motion that is played at first; None for none.
 
     Raises:
         UserError: the port is in use, or viser is not installed.
@@ -112,7 +117,7 @@ class ViewServer:
 
     def __init__(
         self,
-        avatar: Any,
+        avatar: TrainedField,
         look: ViewerLook,
         *,
         host: str = "127.0.0.1",
@@ -128,14 +133,14 @@ class ViewServer:
 
         self._woken = threading.Event()
         self._is_stopped = False
-        self._is_ready = False  # whether there is something to see
+        self._is_ready = False  # whether there is something to show
         self.state = ViewerState(ViewerBody(avatar), look, self._woken.set)
         with _silence():
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.port: int = self.server.get_port()
-        if port not in (0, self.port):  # somebody else was faster, and viser went on to the next
+        if port not in (0, self.port):  # another program was faster, and viser took the next port
             self._stop_server()
-            raise UserError(f"port {port} is in use; port {self.port} is free: give --port {self.port}")
+            raise UserError(_in_use(port, f"{self.port}"))
         if first_motion is not None:
             self.state.load_motion(*first_motion[1:])
         self.scene = ViewerScene(self.server, self.state, lambda joint: self.controls.pose.choose_joint(joint))
@@ -151,19 +156,19 @@ class ViewServer:
         if first_motion is not None:
             self.state.play()
         self.server.on_client_connect(lambda client: self._woken.set())
-        self.server.on_client_disconnect(lambda client: self._part(client.client_id))
+        self.server.on_client_disconnect(lambda client: self._forget_client(client.client_id))
         self._thread = threading.Thread(target=self._run, name="snarf-view", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Serve no more."""
+        """Stop the server and the threads."""
         self._is_stopped = True
         self._woken.set()
         self._thread.join(timeout=10)
         self.state.stop()
         self._stop_server()
 
-    def _part(self, client_id: int) -> None:
+    def _forget_client(self, client_id: int) -> None:
         self.scene.let_go(client_id)
         self._woken.set()
 
@@ -172,7 +177,7 @@ class ViewServer:
             self.server.stop()
 
     def wait(self) -> None:
-        """Return when the page is not kept up to date any more; a signal such as Ctrl-C is heard meanwhile."""
+        """Wait until the page is no longer updated; signals such as Ctrl-C are handled meanwhile."""
         while self._thread.is_alive():
             self._thread.join(timeout=0.5)
 
@@ -186,19 +191,19 @@ class ViewServer:
             start = time.monotonic()
             try:
                 waits = self._step()
-            except Exception as error:  # one picture that fails must not end the viewer
-                log.error("the viewer goes on after: %s: %s", type(error).__name__, error, exc_info=error)
+            except Exception as error:  # a picture that fails must not end the viewer
+                log.error("the viewer continues after: %s: %s", type(error).__name__, error, exc_info=error)
                 waits = [1.0]
             if self._is_ready and not self.server.get_clients():
-                waits = []  # nobody looks: no need to play
+                waits = []  # no clients: no need to play
             timeout = min((wait for wait in waits if wait is not None), default=None)
             rest = _SHORTEST_S - (time.monotonic() - start)
-            if rest > 0:  # changes that come meanwhile go into the next picture together
+            if rest > 0:  # changes made meanwhile go into one picture
                 time.sleep(rest)
             timeout = None if timeout is None else max(timeout - max(rest, 0.0), 0.0)
 
     def _step(self) -> list[float | None]:
-        """Show the present picture; return for how many seconds each part is content."""
+        """Show the current picture; return the seconds until each part needs an update."""
         picture, frame_wait = self.state.picture()
         self._is_ready = picture.mesh is not None or picture.message is not None
         self.scene.show(picture)
@@ -207,10 +212,10 @@ class ViewServer:
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Keep viser's own announcements, which no option turns off, from the terminal."""
+    """Hide the messages of viser on the terminal, which no option turns off."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield
 
 
 def _no_motion(name: str) -> tuple[Any, Any]:
-    raise UserError(f"no motion '{name}'")
+    raise UserError(f"motion: wanted none, got '{name}'; this viewer has no motions")

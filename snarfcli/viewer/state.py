@@ -1,4 +1,4 @@
-"""The viewer without its page: pose, motion and look as they were chosen, and which picture follows from them."""
+"""State of the viewer, independent of the web page: pose, motion and look, and the picture that they give."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.motions import Motion
 from snarfcli.viewer.body import Posed, ShapeRequest, ViewerBody
 from snarfcli.viewer.joints import mirrored_joint
 from snarfcli.viewer.picture import Picture, ViewerLook
@@ -21,19 +22,19 @@ from snarfcli.viewer.worker import BackgroundWorker
 __all__ = ["ViewerState"]
 
 _SHAPE_EVERY_S = 0.1  # while playing
-_FLOOR_FRAMES = 40  # of a motion, looked at to find its floor
+_FLOOR_FRAMES = 40  # frames of a motion in which the floor is searched for
 
 
 class ViewerState:
-    """What was chosen on the page, by whoever looks at it: everybody sees and changes the same.
+    """Pose, motion and look, shared by all clients.
 
-    Changes may come from any thread. One thread calls `picture` whenever `wake` was called or the time it was told is over.
+    Any thread may change it. One thread calls `picture` after each `wake`, and when the time that it returned has passed.
 
     Args:
-        body: the avatar.
-        look: how it is shown at first.
+        body: computes the surfaces of the avatar.
+        look: initial look.
         wake: called after every change.
-        clock: seconds.
+        clock: returns the time, seconds.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class ViewerState:
         self.body = body
         self.look = look if body.has_weights else replace(look, surface="field", weight_colors=False, shows_canonical=False)
         self.player = Player()
-        self.motion: Any = None
+        self.motion: Motion | None = None
         """The motion, with `poses` [T, J, 3] and `translation` [T, 3]; None for none."""
         self.floor_y = 0.0
         """Height of the floor, metres."""
@@ -61,45 +62,45 @@ class ViewerState:
     # ---------------------------------------------------------------- the pose
     @property
     def posed(self) -> Posed:
-        """The pose that is wanted."""
+        """The current pose."""
         with self._lock:
             return self._posed
 
     def turn_joint(self, joint: int, vector: NDArray[np.float64]) -> None:
-        """Give a joint the rotation vector [3], radians, relative to its parent; 0 turns the whole body."""
+        """Set the rotation vector [3] of a joint, radians, relative to its parent; joint 0 rotates the whole body."""
         with self._lock:
-            pose = self._held().pose.copy()
+            pose = self._paused().pose.copy()
             pose[joint] = vector
-            self._take(pose, self._posed.translation)
+            self._set_pose(pose, self._posed.translation)
 
     def mirror_joint(self, joint: int) -> None:
-        """Turn the joint on the other side as this one is turned, mirrored."""
+        """Copy the rotation of a joint, mirrored, to the joint on the other side."""
         with self._lock:
-            other, vector = mirrored_joint(self.body.skeleton, joint, self._held().pose[joint])
+            other, vector = mirrored_joint(self.body.skeleton, joint, self._paused().pose[joint])
             if other != joint:
                 self.turn_joint(other, vector)
 
     def move_root(self, axis: int, metres: float) -> None:
-        """Put the root at so many metres from its place at rest, along one axis."""
+        """Set the translation of the root along one axis, metres."""
         with self._lock:
-            translation = self._held().translation.copy()
+            translation = self._paused().translation.copy()
             translation[axis] = metres
-            self._take(self._posed.pose, translation)
+            self._set_pose(self._posed.pose, translation)
 
     def reset_pose(self) -> None:
         """Stand on the floor in the rest pose."""
         with self._lock:
             self.player.pause(self._clock())
-            self._take(np.zeros_like(self._posed.pose), np.zeros(3))
-            self._stand()
+            self._set_pose(np.zeros_like(self._posed.pose), np.zeros(3))
+            self._stand_on_floor()
 
     # ---------------------------------------------------------------- the motion
-    def load_motion(self, motion: Any, bone_transforms: NDArray[np.float32] | None = None) -> None:
-        """Take a motion and go to its first frame; None takes it away, and the pose stays as it is.
+    def load_motion(self, motion: Motion | None, bone_transforms: NDArray[np.float32] | None = None) -> None:
+        """Load a motion and go to its first frame; None removes the motion and keeps the pose.
 
         Args:
-            motion: `Motion` of the avatar's skeleton.
-            bone_transforms: [T, J, 4, 4] canonical to posed, metres, where joints stretch; None where the poses say it all.
+            motion: motion of the skeleton of the avatar.
+            bone_transforms: [T, J, 4, 4], canonical to posed, metres; needed where joints stretch, which poses cannot express.
         """
         with self._lock:
             self.motion, self._motion_transforms = motion, bone_transforms
@@ -112,16 +113,16 @@ class ViewerState:
             self._go_to(0)
 
     def play(self) -> None:
-        """Let the motion run."""
+        """Play the motion."""
         with self._lock:
             self.player.play(self._clock())
             self._wake()
 
     def pause(self) -> Posed:
-        """Hold the motion; return the pose that it is held in."""
+        """Pause the motion; return its current pose."""
         with self._lock:
             self._wake()
-            return self._held()
+            return self._paused()
 
     def seek(self, frame: int) -> None:
         """Go to a frame of the motion."""
@@ -130,13 +131,13 @@ class ViewerState:
             self._go_to(self.player.frame(self._clock()))
 
     def change_speed(self, speed: float) -> None:
-        """Play so many times as fast as the motion was."""
+        """Set the speed; 1 is the original speed."""
         with self._lock:
             self.player.change_speed(speed, self._clock())
             self._wake()
 
     def change_looping(self, is_looping: bool) -> None:
-        """Start again after the last frame, or not."""
+        """Set whether the motion restarts after its last frame."""
         with self._lock:
             self.player.change_looping(is_looping, self._clock())
             self._wake()
@@ -153,19 +154,19 @@ class ViewerState:
             self._wake()
 
     def stop(self) -> None:
-        """Make no more surfaces."""
+        """Stop computing surfaces."""
         self._worker.stop()
 
     # ---------------------------------------------------------------- the picture
     def picture(self) -> tuple[Picture, float | None]:
-        """Return what is to be seen now, and for how many seconds at most; None for until `wake` is called."""
+        """Return the current picture, and the seconds until the next one is due; None for not before `wake` is called."""
         with self._lock:
             now = self._clock()
             frame = self.player.frame(now)
             if self.motion is not None and frame != self._frame:
                 self._go_to(frame)
             outcome = self._worker.take()
-            if outcome is not None and self._surfaces.keep(*outcome):  # now it is known how far down the feet reach
+            if outcome is not None and self._surfaces.store(*outcome):  # now the lowest point of the feet is known
                 self._find_floor()
             posed, look = self._posed, self.look
             requests = self._surfaces.wanted(posed, look)
@@ -188,15 +189,15 @@ class ViewerState:
             return picture, self.player.seconds_to_next(now)
 
     # ---------------------------------------------------------------- changes
-    def _held(self) -> Posed:
-        """Stop playing at the frame that is due, and return its pose."""
+    def _paused(self) -> Posed:
+        """Pause at the current frame, and return its pose."""
         now = self._clock()
         self.player.pause(now)
         if self.motion is not None and self.player.frame(now) != self._frame:
             self._go_to(self.player.frame(now))
         return self._posed
 
-    def _take(
+    def _set_pose(
         self,
         pose: NDArray[np.float64],
         translation: NDArray[np.float64],
@@ -208,12 +209,13 @@ class ViewerState:
         self._wake()
 
     def _go_to(self, frame: int) -> None:
-        """Take the pose of a frame of the motion."""
+        """Set the pose to that of a frame of the motion."""
         self._frame = frame
-        self._take(*self._of_frame(frame))
+        self._set_pose(*self._pose_of_frame(frame))
 
-    def _of_frame(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32] | None]:
-        """Return pose, translation and, where joints stretch, bone transforms of a frame, over one spot if so wished."""
+    def _pose_of_frame(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32] | None]:
+        """Return pose, translation and, if given, bone transforms of a frame; without horizontal translation if in place."""
+        assert self.motion is not None
         pose, translation = self.motion.poses[frame], self.motion.translation[frame].copy()
         transforms = None if self._motion_transforms is None else self._motion_transforms[frame].copy()
         if self.look.is_in_place:
@@ -222,14 +224,14 @@ class ViewerState:
             translation[[0, 2]] = 0
         return pose, translation, transforms
 
-    def _stand(self) -> None:
-        """Put the body onto the floor by its height."""
+    def _stand_on_floor(self) -> None:
+        """Move the body vertically so that it stands on the floor."""
         low = self._surfaces.lowest(self._posed.transforms)
         translation = np.add(self._posed.translation, (0.0, self.floor_y - low, 0.0))
-        self._take(self._posed.pose, translation)
+        self._set_pose(self._posed.pose, translation)
 
     def _find_floor(self) -> None:
-        """Put the floor below the lowest point of the motion; without one, below the body in its rest pose."""
+        """Set the height of the floor to the lowest point of the motion; without one, of the body in its rest pose."""
         if self.motion is None:
             zeros = np.zeros_like(self._posed.pose)
             self.floor_y = self._surfaces.lowest(self.body.transforms(zeros, np.zeros(3)))
@@ -237,6 +239,6 @@ class ViewerState:
         frames = np.unique(np.linspace(0, self.motion.num_frames - 1, _FLOOR_FRAMES).astype(int))
         lowest = []
         for frame in frames:
-            pose, translation, transforms = self._of_frame(frame)
+            pose, translation, transforms = self._pose_of_frame(frame)
             lowest.append(self._surfaces.lowest(self.body.transforms(pose, translation) if transforms is None else transforms))
         self.floor_y = min(lowest)

@@ -1,4 +1,4 @@
-"""A surface in viser's scene: one colour, or a colour at each vertex, renewed without flicker."""
+"""A surface in the scene of viser, with one colour or a colour per vertex, updated without flicker."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from snarfcli.viewer.colored import colored_glb
 
 __all__ = ["ShownSurface"]
 
-# The browser takes a moment to read a .glb and shows nothing meanwhile. So the next one is loaded unseen, and takes the place
-# of the one before when this time is over.
+# The browser takes a moment to load a .glb and shows nothing meanwhile. So the next one is loaded hidden, and replaces the
+# current one after this time.
 _LOADING_S = 0.1
 
 
@@ -21,8 +21,8 @@ class ShownSurface:
     """One surface on the page.
 
     Args:
-        scene: viser's scene.
-        name: of its nodes.
+        server: server of viser.
+        name: path of its nodes in the scene.
     """
 
     def __init__(self, server: Any, name: str) -> None:
@@ -33,21 +33,21 @@ class ShownSurface:
         self._plain: Any = None
         self._faces: Any = None
         self._colored: list[Any] = [None, None]
-        self._seen = 0  # which of the two is seen
+        self._seen = 0  # which of the two is visible
         self._loading_since: float | None = None
-        self._latest: tuple | None = None  # what is to be loaded next
+        self._latest: tuple | None = None  # mesh to load next
         self._loading: Any = None
         self._wanted: tuple | None = None
         self._arrays: tuple = ()
         self.seen: Any = None
-        """What was said to go with the mesh that is seen now."""
+        """The `goes_with` of the visible mesh."""
 
     def place(self, position: tuple[float, float, float]) -> None:
-        """Put its origin somewhere."""
+        """Set the position of its origin."""
         self._frame.position = position
 
     def hide(self) -> None:
-        """Show nothing."""
+        """Hide the surface."""
         self._frame.visible, self.seen = False, None
 
     def show(
@@ -60,12 +60,22 @@ class ShownSurface:
         is_wireframe: bool,
         goes_with: Any = None,
     ) -> None:
-        """Show a mesh: of one colour, or coloured by its weights [V, J]; the latter a moment later."""
+        """Show a mesh in one colour, or coloured by its weights [V, J], which takes a moment.
+
+        Args:
+            vertices: [V, 3], metres.
+            faces: [F, 3].
+            weights: [V, J]; None for one colour.
+            color: sRGB.
+            opacity: 0 to 1.
+            is_wireframe: whether edges are drawn, in one colour.
+            goes_with: value of `seen` once this mesh is visible.
+        """
         self._frame.visible = True
         wanted = (id(vertices), id(faces), id(weights), color, opacity, is_wireframe)
         if wanted == self._wanted and goes_with is None:
             return
-        self._wanted, self._arrays = wanted, (vertices, faces, weights)  # held, so that no other array gets their numbers
+        self._wanted, self._arrays = wanted, (vertices, faces, weights)  # kept, so that no new array gets their ids
         if weights is not None and not is_wireframe:  # a .glb cannot be drawn as a wireframe
             self._latest = (vertices, faces, weights, opacity, goes_with)
             return
@@ -86,7 +96,7 @@ class ShownSurface:
         self._plain.visible = True
 
     def advance(self, now: float) -> float | None:
-        """Load and swap coloured meshes as time goes by; return when to call again, None if there is nothing to do."""
+        """Load and swap coloured meshes; return the time of the next call, None if there is nothing to do."""
         if self._loading_since is not None:
             if now < self._loading_since + _LOADING_S:
                 return self._loading_since + _LOADING_S

@@ -1,4 +1,4 @@
-"""One thread for what takes long; it has no queue, so that nothing old is ever waited for."""
+"""Background thread for slow requests. It has no queue, so that outdated requests never delay the newest one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ __all__ = ["BackgroundWorker"]
 
 
 class BackgroundWorker:
-    """Does one thing at a time, in a thread of its own.
+    """A thread that runs one request at a time.
 
-    Whoever wants something done asks again when the worker is idle, for what is wanted then: there are no old requests.
+    A request to a busy worker is rejected. The caller repeats it when the worker is idle, as it is then.
 
     Args:
-        work: what is done with a request; may raise.
-        done: told when the worker is idle again, from its thread.
+        work: computes the result of a request; may raise.
+        done: called from the thread when a request has finished.
     """
 
     def __init__(self, work: Callable[[Any], Any], done: Callable[[], None]) -> None:
@@ -31,12 +31,12 @@ class BackgroundWorker:
 
     @property
     def is_idle(self) -> bool:
-        """Whether `start` would be heard: nothing is being done, and the last outcome was taken."""
+        """Whether `start` would be accepted: no request is running, and the last outcome was taken."""
         with self._changed:
             return self._request is None and self._outcome is None
 
     def start(self, request: Any) -> bool:
-        """Begin with a request; False if the worker is busy, and then it is forgotten."""
+        """Start a request; return False, and reject it, if the worker is busy."""
         with self._changed:
             if self._request is not None or self._outcome is not None or self._is_stopped:
                 return False
@@ -45,13 +45,13 @@ class BackgroundWorker:
             return True
 
     def take(self) -> tuple[Any, Any, BaseException | None] | None:
-        """Return the request that was done last, its result and the error it raised; None if there is nothing new."""
+        """Return the last request with its result and its exception, once; None if there is no new outcome."""
         with self._changed:
             outcome, self._outcome = self._outcome, None
             return outcome
 
     def stop(self, patience_s: float = 60.0) -> None:
-        """Take no more requests, and wait for what is being done: a process that ends in the middle of it aborts."""
+        """Accept no more requests, and wait for the running one: the process would abort if it exited during native code."""
         with self._changed:
             self._is_stopped = True
             self._changed.notify_all()
@@ -67,7 +67,7 @@ class BackgroundWorker:
             result, error = None, None
             try:
                 result = self._work(request)
-            except Exception as raised:  # whatever it is, the page shows it and goes on
+            except Exception as raised:  # the page shows any error, and the viewer continues
                 error = raised
             with self._changed:
                 self._request, self._outcome = None, (request, result, error)

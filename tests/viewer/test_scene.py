@@ -59,10 +59,10 @@ def test_a_look_that_changes_between_picture_and_stage_is_not_lost(scene, watche
     watched.state.change_look(weight_colors=True, shows_skeleton=True)
     scene.show(picture)
     assert scene._body._plain.visible
-    assert scene._joints is None
+    assert scene._skeleton_nodes is None
     show_settled(scene, watched)
     assert not scene._body._plain.visible
-    assert scene._joints.visible
+    assert scene._skeleton_nodes.joints.visible
     assert [node.visible for node in scene._body._colored if node is not None] == [True]
 
 
@@ -96,7 +96,9 @@ def test_the_handle_follows_the_joint_unless_somebody_holds_it(scene, watched):
     scene.turn_chosen(quarter, is_over=True, client_id=4)
     show_settled(scene, watched)
     np.testing.assert_allclose(watched.state.posed.pose[1], (0, 0, np.pi / 2), atol=1e-6)
-    np.testing.assert_allclose(scene._handle.wxyz, straight, atol=1e-6)  # as the page that turns it has it, not we
+    np.testing.assert_allclose(
+        scene._skeleton_nodes.handle.wxyz, straight, atol=1e-6
+    )  # as on the page that turns it
     scene.let_go(3)
     show_settled(scene, watched)
-    np.testing.assert_allclose(scene._handle.wxyz, quarter, atol=1e-6)
+    np.testing.assert_allclose(scene._skeleton_nodes.handle.wxyz, quarter, atol=1e-6)

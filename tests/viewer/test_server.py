@@ -160,7 +160,7 @@ def test_every_look(server):
         page.change("Wireframe", True)
         page.until_node("/avatar/plain", "wireframe")
         page.change("Surface", "field")
-        page.until_text("made in")
+        page.until_text("surface in")
         page.change("Surface", "skinned")
         page.until_text("skinned")
 
@@ -199,7 +199,7 @@ def test_an_avatar_without_weights_has_no_choice_of_surface():
     server = ViewServer(avatar, SMALL)
     try:
         with Page(server.server) as page:
-            page.until_text("made in")
+            page.until_text("surface in")
             inputs = [message["props"] for message in page.messages if "label" in message.get("props", {})]
             shown = {props["label"]: props for props in inputs}
             assert not shown["Weights in colour"]["visible"]
@@ -224,12 +224,12 @@ def test_a_skeleton_of_one_joint_turns_as_a_whole():
 
 
 def test_a_port_in_use_names_the_next_one(server):
-    with pytest.raises(UserError, match=rf"port {server.port} is in use; port \d+ is free: give --port"):
+    with pytest.raises(UserError, match=rf"port: wanted a free one, got {server.port}, which is in use; give --port \d+"):
         check_port("127.0.0.1", server.port)
     with pytest.raises(UserError, match="is in use"):
         ViewServer(ToyAvatar(), SMALL, port=server.port)
     check_port("127.0.0.1", 0)
-    with pytest.raises(UserError, match=r"host 203.0.113.7 is no address of this machine"):  # RFC 5737: of no machine
+    with pytest.raises(UserError, match=r"host: wanted an address of this machine, got 203.0.113.7"):  # RFC 5737: of no machine
         check_port("203.0.113.7", 8080)
 
 

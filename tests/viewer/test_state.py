@@ -146,7 +146,7 @@ def test_a_pose_without_surface_is_told_and_the_viewer_goes_on(watched, caplog):
     watched.avatar.query = broken
     watched.state.turn_joint(1, BEND / 3)
     assert watched.settled().message == "out of memory"
-    assert "goes on after: RuntimeError" in caplog.text
+    assert "continues after: RuntimeError" in caplog.text
 
 
 def test_an_avatar_without_any_surface_is_told_too():

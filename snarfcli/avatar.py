@@ -24,7 +24,7 @@ class Avatar(TrainedField):
     """An animatable avatar of one subject."""
 
     def skinned_surface(self, resolution: int = 256, keep_share: float = 0.01) -> SkinnedSurface:
-        """Return the canonical mesh that `mesh(surface="skinned")` poses, computed once; see `meshing.skinned_surface`."""
+        """Return the surface that `mesh(surface="skinned")` poses, computed once; see `meshing.skinned_surface`."""
         return skinned_surface(self, resolution, keep_share)
 
     def mesh(self, pose: Tensor, translation: Tensor | None = None, *, resolution: int = 256, surface: str = "field") -> Mesh:
@@ -35,10 +35,10 @@ class Avatar(TrainedField):
             translation: [3] or [1, 3], metres.
             resolution: voxels along the longest side.
             surface: "field" (the union of all correspondences, watertight) or "skinned" (the canonical mesh moved by
-                linear blend skinning, with its weights; after the first one nearly for free, always with the same faces).
+                linear blend skinning, with its weights; fast after the first call, always with the same faces).
 
         Raises:
-            ValueError: `surface` is neither, the system cannot skin a surface, or the field has none in this pose.
+            ValueError: `surface` is unknown, the system has no skinning weights, or the field has no surface in this pose.
         """
         pose = torch.as_tensor(pose).reshape(-1, 3)
         translation = None if translation is None else torch.as_tensor(translation).reshape(3)
@@ -56,23 +56,23 @@ class Avatar(TrainedField):
         weight_colors: bool = False,
         overwrite: bool = False,
     ) -> ExportReport:
-        """Write a rigged, animated character as one `.glb` file, whole or not at all; `snarf export` does the same.
+        """Write a rigged, animated character as one `.glb` file, like `snarf export`. The file is whole or absent.
 
         Args:
-            path: the file.
-            motions: a clip each; a `Clip` where joints stretch, so that it needs bone transforms.
-            triangles: at most; None leaves the mesh as it was extracted.
-            influences: joints that move one vertex, 4 or 8.
-            morph_targets: shapes that are blended for the pose-dependent shape, at most; 0 for the mean shape.
+            path: of the file.
+            motions: one or more; each becomes a clip. A `Clip` has bone transforms for joints that stretch.
+            triangles: maximum number of triangles; None keeps the extracted mesh.
+            influences: maximum number of joints per vertex, 4 or 8.
+            morph_targets: maximum number of morph targets for the pose-dependent shape; 0 for the mean shape.
             resolution: voxels along the longest side of the canonical box.
             weight_colors: whether vertices are coloured by their skinning weights.
-            overwrite: whether a file that is there already is replaced.
+            overwrite: whether an existing file is replaced.
 
         Returns:
-            What was written, and how near it comes to `mesh(surface="skinned")`.
+            Facts about the file, and its deviation from `mesh(surface="skinned")`.
 
         Raises:
-            ValueError: the system has no skinning weights, the field no surface, or an argument cannot be used.
+            ValueError: the system has no skinning weights, the field has no surface, or an argument is out of range.
         """
         several = [motions] if isinstance(motions, Motion | Clip) else motions
         clips = [motion if isinstance(motion, Clip) else Clip(motion) for motion in several]

@@ -90,13 +90,14 @@ def run(config: DoctorConfig) -> int:
 
 def _check_data(config: DoctorConfig, data: DataConfig) -> int:
     """Report whether a data set can be used and what to correct; draw each examined subject."""
-    from snarfcli.datasets.checking import LookedAt, Remark, check_subject
-    from snarfcli.datasets.sources import Request, find_source
+    from snarfcli.datasets.checking import ExaminedFrame, Remark, check_subject
+    from snarfcli.datasets.registry import find_dataset
+    from snarfcli.datasets.request import DataRequest
     from snarfcli.datasets.subjects import SubjectData
     from snarfcli.rendering.bones import write_bones_figure
 
-    request = Request(data, Path(config.data_root), config.body)
-    subjects = [config.subject] if config.subject not in (None, "all") else list(find_source(data.name).subjects(request))
+    request = DataRequest(data, Path(config.data_root), config.body)
+    subjects = [config.subject] if config.subject not in (None, "all") else list(find_dataset(data.name).subjects(request))
     chosen = subjects if config.subject is not None else subjects[:_SUBJECTS_CHECKED]
     log.info("data set %s, subjects: %s", data.name, _listed(subjects))
     unusable: list[str] = []
@@ -106,7 +107,7 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
             figure = Path(config.figure)
             figure = figure if len(chosen) == 1 else figure.with_stem(f"{figure.stem}_{subject}")
 
-        def draw(data: SubjectData, frames: list[LookedAt], figure: Path = figure) -> Remark:
+        def draw(data: SubjectData, frames: list[ExaminedFrame], figure: Path = figure) -> Remark:
             write_bones_figure(figure, f"{data.data} data, subject {data.subject}", data.skeleton, frames)
             return Remark("figure", str(figure))
 

@@ -57,12 +57,13 @@ def run(config: PreprocessConfig) -> None:
         UserError: a value cannot be used, a subject or sequence is unknown, or the samples there do not go with the settings.
         OSError: the data folder cannot be written to, or the disk is full.
     """
-    from snarfcli.datasets.sources import Request, find_source
+    from snarfcli.datasets.registry import find_dataset
+    from snarfcli.datasets.request import DataRequest
     from snarfcli.parallel import count_cores
     from snarfcli.samples.preprocessing import preprocess_subject
     from snarfcli.sampling import SamplingSettings
 
-    source = find_source(config.data.name)
+    source = find_dataset(config.data.name)
     sampling = SamplingSettings(
         points_per_frame=config.points_per_frame,
         surface_noise_m=config.surface_noise_m,
@@ -81,7 +82,7 @@ def run(config: PreprocessConfig) -> None:
     if config.workers < 0:
         raise UserError(f"workers: wanted a number of processes, or 0 for one a core, got {config.workers}")
     workers = config.workers or count_cores()
-    request = Request(config.data, Path(config.data_root), config.body)
+    request = DataRequest(config.data, Path(config.data_root), config.body)
     for subject in source.subjects(request) if config.subject == "all" else [config.subject]:
         data = source.load(subject, request)
         log.info("subject %s of %s data, %d processes", data.subject, data.data, workers)

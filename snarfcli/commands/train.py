@@ -16,7 +16,7 @@ from snarfcli.avatar import Avatar
 from snarfcli.bodies import MeshTemplate
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.deformer_checks import check_search, check_skinning
-from snarfcli.datasets.builtin import check_subject
+from snarfcli.datasets.builtin import require_subject
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.errors import UserError
@@ -109,7 +109,7 @@ def run(config: TrainConfig) -> None:
     set_threads(config.threads)
     seed_everything(config.seed)
     if config.data.name == "builtin" and not samples_folder(config.data_root, "builtin", config.subject).exists():
-        check_subject(config.subject)
+        require_subject(config.subject)
     store = SampleStore.open(config.data_root, config.data.name, config.subject)
     sequences = store.sequences("train")
     frames = sum(len(sequence.train_frames) for sequence in sequences)

@@ -14,12 +14,21 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
 from snarfcli.bodies import Body, Skeleton, find_body, load_body
-from snarfcli.datasets.sources import Request
-from snarfcli.datasets.subjects import SequenceSpec, Split, body_sequence
+from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.splits import Split
+from snarfcli.datasets.subjects import SequenceSpec, body_sequence
 from snarfcli.errors import UserError
 from snarfcli.motions import read_motion, read_shape
 
-__all__ = ["Person", "amass_sequences", "find_sequences", "find_subjects", "papers_split", "read_person", "walk_files"]
+__all__ = [
+    "AmassSubject",
+    "amass_sequences",
+    "find_sequences",
+    "find_subjects",
+    "papers_split",
+    "read_amass_subject",
+    "walk_files",
+]
 
 _DEPTH = 7  # archives unpack to at most three folders, which people put into folders of their own
 _LEFT_OUT = {
@@ -77,18 +86,18 @@ def find_subjects(root: Path, subjects: Iterable[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
+class AmassSubject:
     """Whose motions they are: a body model in this person's shape."""
 
     body: Body
     betas: NDArray[np.float64]
-    """[S] shape parameters."""
+    """[S], shape parameters."""
     skeleton: Skeleton
     sources: tuple[str, ...]
     """Which files were taken."""
 
 
-def read_person(files: Mapping[str, Path], request: Request) -> Person:
+def read_amass_subject(files: Mapping[str, Path], request: DataRequest) -> AmassSubject:
     """Return the person of some sequences: shape and gender from `shape.npz` beside them or from a sequence, and the body.
 
     Raises:
@@ -102,7 +111,7 @@ def read_person(files: Mapping[str, Path], request: Request) -> Person:
     # SMPL-X has a shape space of its own
     caution = " (meant for SMPL-X: on SMPL's body another build)" if shape.stem.lower().endswith("_stageii") else ""
     sources = (f"body {path} ({gender})", f"shape {shape}{caution}", f"motions {next(iter(files.values())).parent}")
-    return Person(body, betas, body.skeleton(betas), sources)
+    return AmassSubject(body, betas, body.skeleton(betas), sources)
 
 
 def _first_shape(files: Sequence[Path]) -> tuple[Path, str, NDArray[np.float64]]:
@@ -120,7 +129,7 @@ _SMPL_BETAS = 10  # the papers use the first ten
 
 
 def amass_sequences(
-    files: Mapping[str, Path], splits: Mapping[str, Split], person: Person, hands: str, where: Path
+    files: Mapping[str, Path], splits: Mapping[str, Split], person: AmassSubject, hands: str, where: Path
 ) -> tuple[list[SequenceSpec], list[tuple[str, str]]]:
     """Read sequences without their translation, as the papers do.
 

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Body, builtin_body, find_body, load_body
-from snarfcli.datasets.sources import Request
-from snarfcli.datasets.subjects import Split, SubjectData, body_sequence, body_template
+from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.splits import Split
+from snarfcli.datasets.subjects import SubjectData, body_sequence, body_template
 from snarfcli.errors import UserError, nearest
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, builtin_motion
 
-__all__ = ["BUILTIN_SUBJECTS", "HELD_OUT_SEQUENCES", "builtin_subject", "check_subject", "load", "subjects"]
+__all__ = ["BUILTIN_SUBJECTS", "HELD_OUT_SEQUENCES", "builtin_subject", "load", "require_subject", "subjects"]
 
 HELD_OUT_SEQUENCES = {
     "50002": "chicken_wings",
@@ -56,7 +57,7 @@ def _sequence_names(subject: str) -> tuple[str, ...]:
     return tuple(name for name in TRAINING_SEQUENCES if name == held_out or name in chosen)
 
 
-def check_subject(subject: str) -> None:
+def require_subject(subject: str) -> None:
     """Refuse an id that is none of `BUILTIN_SUBJECTS`, with the nearest one.
 
     Raises:
@@ -67,16 +68,16 @@ def check_subject(subject: str) -> None:
         raise UserError(f"no built-in subject '{subject}'{hint} Known are {', '.join(BUILTIN_SUBJECTS)}")
 
 
-def subjects(request: Request) -> tuple[str, ...]:
+def subjects(request: DataRequest) -> tuple[str, ...]:
     """Return the ids of the built-in subjects."""
     return BUILTIN_SUBJECTS
 
 
-def load(subject: str, request: Request) -> SubjectData:
+def load(subject: str, request: DataRequest) -> SubjectData:
     """Make one of the built-in subjects, with the built-in body or with the one that was asked for."""
     if request.body is None:
         return builtin_subject(subject)
-    check_subject(subject)
+    require_subject(subject)
     path = find_body(request.body, "smpl", _GENDER)
     return builtin_subject(subject, load_body(path), f"body {path}")
 
@@ -93,7 +94,7 @@ def builtin_subject(subject: str | int, body: Body | None = None, source: str = 
         UserError: there is no such subject; the message names the nearest valid id.
     """
     subject = str(subject)
-    check_subject(subject)
+    require_subject(subject)
     body = body or builtin_body()
     if body.joint_names != SMPL_JOINT_NAMES:
         raise UserError(f"the built-in motions are for SMPL's 24 joints, the body has {body.num_joints}; give an SMPL body")

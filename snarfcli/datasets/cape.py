@@ -19,9 +19,9 @@ import torch
 
 from snarfcli.bodies import Body, find_body, load_body
 from snarfcli.datasets.cape_frames import CapeMeshes, read_cape_frame
-from snarfcli.datasets.sources import Request
-from snarfcli.datasets.splits import split_sequences
-from snarfcli.datasets.subjects import SequenceSpec, Split, SubjectData, body_template
+from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.splits import SPLITS, Split, split_sequences
+from snarfcli.datasets.subjects import SequenceSpec, SubjectData, body_template
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_npy
 from snarfcli.formats.pickles import read_pickle
@@ -37,7 +37,7 @@ _FRAME_RATE = 60.0
 _JOINTS = 24
 
 
-def subjects(request: Request) -> tuple[str, ...]:
+def subjects(request: DataRequest) -> tuple[str, ...]:
     """Return the subjects that are there, such as `00032_longshort`.
 
     Raises:
@@ -50,7 +50,7 @@ def subjects(request: Request) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-def load(subject: str, request: Request) -> SubjectData:
+def load(subject: str, request: DataRequest) -> SubjectData:
     """Return one person in one outfit; frames that cannot be read are left out and listed.
 
     Raises:
@@ -72,14 +72,13 @@ def load(subject: str, request: Request) -> SubjectData:
             sequences.append(_sequence(name, split, folders[name], body, max(1, steps[split])))
         except UserError as error:
             broken.append((name, str(error)))
-    order = ("train", "test", "ood")
-    sequences.sort(key=lambda spec: order.index(spec.split))
+    sequences.sort(key=lambda spec: SPLITS.index(spec.split))
     template = body_template(body, np.zeros(0), skeleton)
     name = f"{person}_{outfit}"
     return SubjectData("cape", name, skeleton, tuple(sequences), template, np.zeros(0), sources, tuple(broken))
 
 
-def _release(request: Request) -> Path:
+def _release(request: DataRequest) -> Path:
     """Return the folder that holds `sequences`."""
     folder = request.folder
     places = [folder, folder / "cape_release", *sorted(folder.glob("*/cape_release")), *sorted(folder.glob("*/*/cape_release"))]
@@ -101,7 +100,7 @@ def _person_and_outfit(subject: str, known: Sequence[str]) -> tuple[str, str]:
     return person, outfit
 
 
-def _minimal_body(person: str, release: Path, request: Request) -> tuple[Body, tuple[str, ...]]:
+def _minimal_body(person: str, release: Path, request: DataRequest) -> tuple[Body, tuple[str, ...]]:
     """Return the SMPL body of a person, with the person's scanned minimal shape as template, and which files were taken."""
     genders_file = release / "misc" / "subj_genders.pkl"
     genders = read_pickle(genders_file, "list of genders")

@@ -26,7 +26,7 @@ class CapeMeshes:
     paths: Sequence[Path]
     """T files."""
     faces: NDArray[np.int32]
-    """[F, 3] SMPL's."""
+    """[F, 3], SMPL's."""
 
     def __len__(self) -> int:
         return len(self.paths)

@@ -11,14 +11,15 @@ import numpy as np
 import torch
 
 from snarfcli.bodies import Skeleton
-from snarfcli.datasets.sources import Request, find_source
+from snarfcli.datasets.registry import find_dataset
+from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.errors import UserError
 from snarfcli.sampling import check_mesh
 from snarfcli.sampling.occupancy import winding_numbers
 from snarfcli.segments import distance_to_segments
 
-__all__ = ["LookedAt", "Remark", "check_subject"]
+__all__ = ["ExaminedFrame", "Remark", "check_subject"]
 
 _FRAMES_LOOKED_AT = 3  # of a sequence, which take a second or two
 _SEQUENCES_LOOKED_AT = 8
@@ -44,21 +45,21 @@ class Remark:
 
 
 @dataclass(frozen=True, eq=False)
-class LookedAt:
+class ExaminedFrame:
     """A frame whose mesh was read, for a picture."""
 
     label: str
     """Sequence and number."""
     vertices: np.ndarray
-    """[V, 3] metres."""
+    """[V, 3], metres."""
     faces: np.ndarray
     """[F, 3]."""
     joints: np.ndarray
-    """[J, 3] posed joints, metres."""
+    """[J, 3], posed joints, metres."""
 
 
 def check_subject(
-    subject: str, request: Request, draw: Callable[[SubjectData, list[LookedAt]], Remark] | None = None
+    subject: str, request: DataRequest, draw: Callable[[SubjectData, list[ExaminedFrame]], Remark] | None = None
 ) -> Iterator[Remark]:
     """Yield what there is to say about one subject.
 
@@ -69,9 +70,9 @@ def check_subject(
         request: which data set, and where.
         draw: makes a picture of some of its frames and says where it is.
     """
-    seen: list[LookedAt] = []
+    seen: list[ExaminedFrame] = []
     try:
-        data = find_source(request.config.name).load(subject, request)
+        data = find_dataset(request.config.name).load(subject, request)
         yield from _about(data, seen)
         if seen and draw is not None:
             some = np.unique(np.linspace(0, len(seen) - 1, _FRAMES_DRAWN).round().astype(int))
@@ -82,12 +83,12 @@ def check_subject(
         yield Remark("not usable", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}", "problem")
 
 
-def _about(data: SubjectData, seen: list[LookedAt]) -> Iterator[Remark]:
+def _about(data: SubjectData, seen: list[ExaminedFrame]) -> Iterator[Remark]:
     for line in data.sources:
         yield Remark("from", line)
     yield from _about_skeleton(data.skeleton)
     yield from _about_sequences(data)
-    looked_at: list[LookedAt] = []
+    looked_at: list[ExaminedFrame] = []
     open_edges: list[int] = []
     some = np.unique(np.linspace(0, len(data.sequences) - 1, _SEQUENCES_LOOKED_AT).round().astype(int))
     for spec in [data.sequences[index] for index in some]:
@@ -103,7 +104,7 @@ def _about(data: SubjectData, seen: list[LookedAt]) -> Iterator[Remark]:
             except UserError as error:
                 yield Remark("mesh", str(error), "problem")
                 continue
-            looked_at.append(LookedAt(label, vertices, faces, _posed_joints(data.skeleton, spec, int(frame))))
+            looked_at.append(ExaminedFrame(label, vertices, faces, _posed_joints(data.skeleton, spec, int(frame))))
             seen.append(looked_at[-1])
     if looked_at:
         yield from _about_meshes(looked_at, open_edges)
@@ -139,7 +140,7 @@ def _about_sequences(data: SubjectData) -> Iterator[Remark]:
         yield Remark("test", "no sequence is held out: there will be no IoU in distribution; name one in data.test", "warning")
 
 
-def _about_meshes(seen: list[LookedAt], open_edges: list[int]) -> Iterator[Remark]:
+def _about_meshes(seen: list[ExaminedFrame], open_edges: list[int]) -> Iterator[Remark]:
     counts = [(len(entry.vertices), len(entry.faces)) for entry in seen]
     sides = [float(np.ptp(entry.vertices, axis=0).max()) for entry in seen]
     same = "the same in all" if len(set(counts)) == 1 else f"{min(counts)[0]} to {max(counts)[0]} vertices"
@@ -158,7 +159,7 @@ def _about_meshes(seen: list[LookedAt], open_edges: list[int]) -> Iterator[Remar
         yield Remark("size", text, "warning")
 
 
-def _about_fit(skeleton: Skeleton, seen: list[LookedAt]) -> Iterator[Remark]:
+def _about_fit(skeleton: Skeleton, seen: list[ExaminedFrame]) -> Iterator[Remark]:
     """Yield whether meshes and skeleton are in the same place."""
     inside, far = [], []
     ends = skeleton.bones + [(joint, joint) for joint in range(skeleton.num_joints)]

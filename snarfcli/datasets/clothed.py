@@ -14,26 +14,26 @@ from numpy.typing import NDArray
 
 from snarfcli.bodies import Body, axis_angle_to_matrix, builtin_body, find_body, load_body
 from snarfcli.bodies.skinning import blend_transforms, transform_points
-from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject, check_subject
+from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject, require_subject
 from snarfcli.datasets.folds import Folds, place_folds
 from snarfcli.datasets.garment import ClothedMesh, Outfit, dress
 from snarfcli.datasets.posed_meshes import ArrayMeshes, BodyMeshes
-from snarfcli.datasets.sources import Request
+from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.subjects import SubjectData
 
 __all__ = ["ClothedBody", "ClothedMeshes", "clothed_subject", "load", "outfit_of", "subjects"]
 
 
-def subjects(request: Request) -> tuple[str, ...]:
+def subjects(request: DataRequest) -> tuple[str, ...]:
     """Return the ids of the built-in subjects."""
     return BUILTIN_SUBJECTS
 
 
-def load(subject: str, request: Request) -> SubjectData:
+def load(subject: str, request: DataRequest) -> SubjectData:
     """Dress one of the built-in subjects, with the built-in body or with the one that was asked for."""
     if request.body is None:
         return clothed_subject(subject)
-    check_subject(subject)
+    require_subject(subject)
     path = find_body(request.body, "smpl", "neutral")
     return clothed_subject(subject, load_body(path), f"body {path}")
 
@@ -99,8 +99,8 @@ class ClothedBody:
         """Return the vertices of cloth and skin, [B, V, 3], metres.
 
         Args:
-            poses: [B, J, 3] axis-angle, radians, global orientation first.
-            translation: [B, 3] metres, none by default.
+            poses: [B, J, 3], axis-angle, radians, global orientation first.
+            translation: [B, 3], metres, none by default.
         """
         mesh, weights, rest, facing, folds = self._made
         skeleton = self.bare.skeleton
@@ -156,8 +156,8 @@ class ClothedMeshes:
 
     Args:
         clothed: the person.
-        poses: [T, J, 3] axis-angle, radians.
-        translation: [T, 3] metres.
+        poses: [T, J, 3], axis-angle, radians.
+        translation: [T, 3], metres.
     """
 
     def __init__(self, clothed: ClothedBody, poses: NDArray, translation: NDArray) -> None:

@@ -9,18 +9,19 @@ import logging
 from pathlib import Path
 
 from snarfcli.checks import check_choice
-from snarfcli.datasets.amass import amass_sequences, find_sequences, find_subjects, papers_split, read_person
-from snarfcli.datasets.sources import Request
-from snarfcli.datasets.subjects import Split, SubjectData, body_template
+from snarfcli.datasets.amass import amass_sequences, find_sequences, find_subjects, papers_split, read_amass_subject
+from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.splits import Split
+from snarfcli.datasets.subjects import SubjectData, body_template
 from snarfcli.errors import UserError, nearest
 from snarfcli.motions.layouts import HANDS
 
-__all__ = ["load", "require_person_files", "subjects"]
+__all__ = ["load", "require_subject_files", "subjects"]
 
 log = logging.getLogger(__name__)
 
 
-def subjects(request: Request) -> tuple[str, ...]:
+def subjects(request: DataRequest) -> tuple[str, ...]:
     """Return the ids of the papers' subjects that are there.
 
     Raises:
@@ -33,14 +34,14 @@ def subjects(request: Request) -> tuple[str, ...]:
     return found
 
 
-def load(subject: str, request: Request) -> SubjectData:
+def load(subject: str, request: DataRequest) -> SubjectData:
     """Return one subject in the papers' split.
 
     Raises:
         UserError: the subject is unknown, or there are no files of it, or no body model.
     """
-    files, splits = require_person_files(subject, request)
-    person = read_person(files, request)
+    files, splits = require_subject_files(subject, request)
+    person = read_amass_subject(files, request)
     hands = request.config.hands
     sequences, broken = amass_sequences(files, splits, person, hands, request.folder)
     prior = papers_split()["poseprior"]
@@ -59,7 +60,7 @@ def load(subject: str, request: Request) -> SubjectData:
     )
 
 
-def require_person_files(subject: str, request: Request) -> tuple[dict[str, Path], dict[str, Split]]:
+def require_subject_files(subject: str, request: DataRequest) -> tuple[dict[str, Path], dict[str, Split]]:
     """Return the files of a subject's sequences, and what each of the papers' sequences is for.
 
     Raises:
@@ -76,7 +77,7 @@ def require_person_files(subject: str, request: Request) -> tuple[dict[str, Path
     return files, splits
 
 
-def _nothing(whose: str, subject: str, request: Request) -> str:
+def _nothing(whose: str, subject: str, request: DataRequest) -> str:
     return (
         f"no DFaust sequences {whose} below {request.folder}: wanted AMASS files such as "
         f"DFaust_67/{subject}/{subject}_hips_poses.npz; see data/README.md, or give data.folder=FOLDER"

@@ -43,29 +43,29 @@ class Folds:
     """Where the folds of one garment are; D places, each driven by one joint."""
 
     depth_m: NDArray[np.float64]
-    """[V] how far the cloth may come in or go out; 0 for skin."""
+    """[V], how far the cloth may come in or go out; 0 for skin."""
     bent: NDArray[np.int64]
-    """[D] joints whose bending folds the cloth."""
+    """[D], joints whose bending folds the cloth."""
     directions: NDArray[np.float64]
-    """[D, 3] directions of their bones in the canonical pose."""
+    """[D, 3], directions of their bones in the canonical pose."""
     facing: NDArray[np.float64]
-    """[V, 3] unit vectors: where the cloth faces in the canonical pose."""
+    """[V, 3], unit vectors: where the cloth faces in the canonical pose."""
     reached: NDArray[np.float64]
-    """[D, V] how much of each place a vertex has, 0 to 1."""
+    """[D, V], how much of each place a vertex has, 0 to 1."""
     waves: NDArray[np.float64]
-    """[D, V] the folds, -1 to 1."""
+    """[D, V], the folds, -1 to 1."""
     twisted: NDArray[np.int64]
-    """[E] joints whose twist folds the cloth."""
+    """[E], joints whose twist folds the cloth."""
     twist_reached: NDArray[np.float64]
-    """[E, V] how much of each twist a vertex has, 0 to 1."""
+    """[E, V], how much of each twist a vertex has, 0 to 1."""
     slanting: NDArray[np.float64]
-    """[2, V] folds that slant to the left and to the right, -1 to 1."""
+    """[2, V], folds that slant to the left and to the right, -1 to 1."""
 
     def displacement(self, turned: NDArray) -> NDArray[np.float64]:
         """Return how far the cloth goes out (positive) or comes in, [B, V], metres, never more than `depth_m`.
 
         Args:
-            turned: [B, J, 3, 3] rotations of the joints from the canonical pose, in their parents' axes.
+            turned: [B, J, 3, 3], rotations of the joints from the canonical pose, in their parents' axes.
         """
         moved = np.einsum("bdij,dj->bdi", turned[:, self.bent], self.directions) - self.directions
         total = np.zeros((len(turned), len(self.depth_m)))
@@ -86,9 +86,9 @@ def place_folds(vertices: NDArray, facing: NDArray, stand_off_m: NDArray, joints
     """Lay the folds of a garment.
 
     Args:
-        vertices: [V, 3] cloth and skin in the canonical pose, metres.
-        facing: [V, 3] their normals.
-        stand_off_m: [V] distance from the body; 0 for skin.
+        vertices: [V, 3], cloth and skin in the canonical pose, metres.
+        facing: [V, 3], their normals.
+        stand_off_m: [V], distance from the body; 0 for skin.
         joints: its joints by SMPL's names in their order, [3] each, metres.
         seed: lengths and places of the folds; the same for the same number.
     """

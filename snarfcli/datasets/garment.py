@@ -46,13 +46,13 @@ class ClothedMesh:
     """A closed mesh of cloth and skin in the canonical pose, and what each vertex follows."""
 
     vertices: NDArray[np.float64]
-    """[V, 3] metres."""
+    """[V, 3], metres."""
     faces: NDArray[np.int64]
-    """[F, 3] vertex numbers, outward."""
+    """[F, 3], vertex numbers, outward."""
     stand_off_m: NDArray[np.float64]
-    """[V] distance from the body; 0 for skin."""
+    """[V], distance from the body; 0 for skin."""
     shares: csr_matrix
-    """[V, B] how much each vertex follows each of the body's; rows sum to 1."""
+    """[V, B], how much each vertex follows each of the body's; rows sum to 1."""
 
     def follow(self, values: NDArray) -> NDArray[np.float64]:
         """Return what the vertices have [V, C] of what the body's have [B, C]."""
@@ -63,8 +63,8 @@ def dress(vertices: NDArray, faces: NDArray, joints: dict[str, NDArray], outfit:
     """Put an outfit on a body.
 
     Args:
-        vertices: [B, 3] the body in the canonical pose (arms sideways, legs apart), metres, y up, facing +z.
-        faces: [F, 3] its closed surface, outward.
+        vertices: [B, 3], the body in the canonical pose (arms sideways, legs apart), metres, y up, facing +z.
+        faces: [F, 3], its closed surface, outward.
         joints: its joints by SMPL's names, [3] each, metres.
         outfit: what to wear.
 

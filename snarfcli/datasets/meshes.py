@@ -33,11 +33,11 @@ from snarfcli.bodies.template import MeshTemplate
 from snarfcli.checks import check_choice
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
 from snarfcli.datasets.recorded_sequence import Recording, World, person_scale
+from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.rigged import RIG_SUFFIXES, bvh_poses, bvh_skeleton, read_rigged_files
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.skeleton_files import SkeletonFile, read_poses, read_skeleton
-from snarfcli.datasets.sources import Request
-from snarfcli.datasets.splits import split_sequences
+from snarfcli.datasets.splits import SPLITS, split_sequences
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
@@ -54,7 +54,7 @@ _NO_POSES = ("split.json", *_SKELETON_FILES)
 _WANTED = "a rigged <subject>.glb, or <subject>/ with skeleton.json and a folder of meshes and poses a sequence"
 
 
-def subjects(request: Request) -> tuple[str, ...]:
+def subjects(request: DataRequest) -> tuple[str, ...]:
     """Return the names of the subjects in the folder.
 
     Raises:
@@ -68,7 +68,7 @@ def subjects(request: Request) -> tuple[str, ...]:
     return tuple(found)
 
 
-def load(subject: str, request: Request) -> SubjectData:
+def load(subject: str, request: DataRequest) -> SubjectData:
     """Read one subject.
 
     Raises:
@@ -85,7 +85,7 @@ def load(subject: str, request: Request) -> SubjectData:
 
 
 # ---------------------------------------------------------------- where things are
-def _folder(request: Request) -> Path:
+def _folder(request: DataRequest) -> Path:
     folder = request.folder if request.config.folder is not None else request.data_root / "meshes"
     if not folder.is_dir():
         kind = "is no folder" if folder.exists() else "is not there"
@@ -93,7 +93,7 @@ def _folder(request: Request) -> Path:
     return folder
 
 
-def _places(request: Request) -> dict[str, Path]:
+def _places(request: DataRequest) -> dict[str, Path]:
     """Return where each subject is: a folder or a rigged file. A folder that is a subject itself counts, too."""
     folder = _folder(request)
     if _skeleton_files(folder):
@@ -105,7 +105,7 @@ def _places(request: Request) -> dict[str, Path]:
     return dict(sorted((files | folders).items()))
 
 
-def _find(subject: str, request: Request) -> Path:
+def _find(subject: str, request: DataRequest) -> Path:
     places = _places(request)
     if subject in places:
         return places[subject]
@@ -268,7 +268,7 @@ def _subject(
     stretched = [name for name, spec in specs.items() if spec.posed_from_rest is not None]
     if stretched:
         sources += (f"joints stretch, scale or come apart in {', '.join(stretched[:6])}: bone transforms are kept as they are",)
-    ordered = sorted(specs.values(), key=lambda spec: ("train", "test", "ood").index(spec.split))
+    ordered = sorted(specs.values(), key=lambda spec: SPLITS.index(spec.split))
     made = template(skeleton) if template is not None else None
     return SubjectData("meshes", subject, skeleton, tuple(ordered), made, sources=sources, broken=broken)
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.files import file_digest
 
 if TYPE_CHECKING:
@@ -55,9 +54,9 @@ class ArrayMeshes:
     """Meshes of one topology that are in memory."""
 
     vertices: NDArray
-    """[T, V, 3] metres."""
+    """[T, V, 3], metres."""
     faces: NDArray
-    """[F, 3] vertex numbers, outward."""
+    """[F, 3], vertex numbers, outward."""
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -80,9 +79,9 @@ class BodyMeshes:
 
     Args:
         body: the model.
-        betas: [S'] shape parameters.
-        poses: [T, J, 3] axis-angle, radians.
-        translation: [T, 3] metres.
+        betas: [S'], shape parameters.
+        poses: [T, J, 3], axis-angle, radians.
+        translation: [T, 3], metres.
     """
 
     def __init__(self, body: Body, betas: NDArray, poses: NDArray, translation: NDArray) -> None:
@@ -116,13 +115,13 @@ class RigMeshes:
     """A mesh moved by the joints of a rig: linear blend skinning, done when frames are chosen."""
 
     vertices: NDArray
-    """[V, 3] in the rest pose, metres."""
+    """[V, 3], in the rest pose, metres."""
     faces: NDArray
-    """[F, 3] vertex numbers, outward."""
+    """[F, 3], vertex numbers, outward."""
     weights: NDArray
-    """[V, J] skinning weights, rows sum to 1."""
+    """[V, J], skinning weights, rows sum to 1."""
     posed_from_rest: NDArray
-    """[T, J, 4, 4] bone transforms, metres."""
+    """[T, J, 4, 4], bone transforms, metres."""
 
     def __len__(self) -> int:
         return len(self.posed_from_rest)
@@ -131,6 +130,8 @@ class RigMeshes:
         return self.chosen(np.array([index]))[0]
 
     def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
+        from snarfcli.bodies.skinning import skin_vertices  # here, since the room `bodies` imports PyTorch
+
         posed = skin_vertices(self.vertices, self.weights, self.posed_from_rest[frames])
         return ArrayMeshes(posed.astype(np.float32), self.faces.astype(np.int32))
 
@@ -150,7 +151,7 @@ class FileMeshes:
     read: Callable[[Path], Mesh]
     """A module-level function that reads one."""
     world_from_file: NDArray
-    """[4, 4] what turns and scales a file's vertices into the data set's world, metres."""
+    """[4, 4], what turns and scales a file's vertices into the data set's world, metres."""
 
     def __len__(self) -> int:
         return len(self.paths)

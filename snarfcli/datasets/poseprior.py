@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from snarfcli.datasets import dfaust
-from snarfcli.datasets.amass import amass_sequences, find_sequences, papers_split, read_person
-from snarfcli.datasets.sources import Request
+from snarfcli.datasets.amass import amass_sequences, find_sequences, papers_split, read_amass_subject
+from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.subjects import SubjectData, body_template
 from snarfcli.errors import UserError
 
@@ -13,7 +13,7 @@ __all__ = ["load", "subjects"]
 subjects = dfaust.subjects
 
 
-def load(subject: str, request: Request) -> SubjectData:
+def load(subject: str, request: DataRequest) -> SubjectData:
     """Return PosePrior's sequences on the body of one DFaust subject, all of them out of distribution.
 
     Raises:
@@ -26,7 +26,7 @@ def load(subject: str, request: Request) -> SubjectData:
             f"no PosePrior sequences below {request.folder}: wanted AMASS files such as MPI_Limits/{prior['subject']}/"
             "op2_poses.npz; see data/README.md, or give data.folder=FOLDER"
         )
-    person = read_person(dfaust.require_person_files(subject, request)[0], request)
+    person = read_amass_subject(dfaust.require_subject_files(subject, request)[0], request)
     splits = dict.fromkeys(prior["ood"], "ood")
     sequences, broken = amass_sequences(extremes, splits, person, request.config.hands, request.folder)
     template = body_template(person.body, person.betas, person.skeleton)

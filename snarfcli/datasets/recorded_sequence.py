@@ -12,7 +12,8 @@ from snarfcli.bodies import pose_from_transforms
 from snarfcli.bodies.skeleton import Skeleton
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
 from snarfcli.datasets.skeleton_files import PoseFile
-from snarfcli.datasets.subjects import SequenceSpec, Split
+from snarfcli.datasets.splits import Split
+from snarfcli.datasets.subjects import SequenceSpec
 from snarfcli.motions import Motion
 
 __all__ = ["PERSON_M", "Recording", "World", "person_scale"]
@@ -36,12 +37,12 @@ class World:
 
     @property
     def turn(self) -> NDArray[np.float64]:
-        """[3, 3] rotation; z up becomes y up, and what faced -y faces +z."""
+        """[3, 3], rotation; z up becomes y up, and what faced -y faces +z."""
         return np.eye(3) if self.up == "y" else np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """[4, 4] from the files to the world: turned and scaled."""
+        """[4, 4], from the files to the world: turned and scaled."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.turn
         return matrix
@@ -111,7 +112,7 @@ def person_scale(vertices: NDArray, wanted: str, given: float | None) -> tuple[f
     """Return metres a unit, and why.
 
     Args:
-        vertices: [V, 3] of a mesh, units of its file.
+        vertices: [V, 3], of a mesh, units of its file.
         wanted: what the user asks for: auto, or a positive number.
         given: what the skeleton's file says, if it does.
     """

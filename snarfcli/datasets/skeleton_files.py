@@ -66,11 +66,11 @@ class SkeletonFile:
     parents: tuple[int, ...]
     """J parents, -1 for a root."""
     joints_rest: NDArray[np.float64]
-    """[J, 3] joint positions in the rest pose."""
+    """[J, 3], joint positions in the rest pose."""
     order: NDArray[np.int64]
-    """[J] place of each joint in the file, by which poses are reordered."""
+    """[J], place of each joint in the file, by which poses are reordered."""
     canonical_pose: NDArray[np.float64] | None = None
-    """[J, 3] axis-angle relative to the rest pose, radians, if the file has one."""
+    """[J, 3], axis-angle relative to the rest pose, radians, if the file has one."""
     up: str | None = None
     """y or z, if the file says it."""
     scale: float | None = None
@@ -84,7 +84,7 @@ class PoseFile:
     frame_rate: float
     """Frames a second."""
     poses: NDArray[np.float64] | None = None
-    """[T, J, 3] axis-angle, radians."""
+    """[T, J, 3], axis-angle, radians."""
     translation: NDArray[np.float64] | None = None
     """[T, 3]."""
     posed_from_rest: NDArray[np.float64] | None = None

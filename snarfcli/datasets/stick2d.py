@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.datasets.posed_meshes import RigMeshes
-from snarfcli.datasets.sources import Request
-from snarfcli.datasets.subjects import SequenceSpec, Split, SubjectData
+from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.splits import Split
+from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.errors import UserError, nearest
 from snarfcli.motions import Motion
 
@@ -39,12 +40,12 @@ _FRAME_RATE = 30.0  # of frames that are in no order of time
 _LOWER, _UPPER = 1, 2
 
 
-def subjects(request: Request) -> tuple[str, ...]:
+def subjects(request: DataRequest) -> tuple[str, ...]:
     """Return the names of the sticks."""
     return STICK_SUBJECTS
 
 
-def load(subject: str, request: Request) -> SubjectData:
+def load(subject: str, request: DataRequest) -> SubjectData:
     """Make one of the sticks.
 
     Raises:

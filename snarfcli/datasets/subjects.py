@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,11 +10,10 @@ from numpy.typing import NDArray
 
 from snarfcli.bodies import Body, MeshTemplate, Skeleton
 from snarfcli.datasets.posed_meshes import BodyMeshes, PosedMeshes
+from snarfcli.datasets.splits import Split
 from snarfcli.motions import Motion
 
-__all__ = ["SequenceSpec", "Split", "SubjectData", "body_sequence", "body_template"]
-
-Split = Literal["train", "test", "ood"]
+__all__ = ["SequenceSpec", "SubjectData", "body_sequence", "body_template"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from snarfcli.commands import preprocess
 from snarfcli.commands.preprocess import PreprocessConfig
 from snarfcli.datasets.posed_meshes import FileMeshes, PosedMeshes
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.sources import Request
+from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
 from snarfcli.formats.surfaces import read_surface
@@ -33,7 +33,7 @@ def subject(monkeypatch: pytest.MonkeyPatch) -> list[SubjectData]:
     """Make the toy the only subject; a test may put another in its place."""
     holder = [toy_subject()]
 
-    def load(name: str, request: Request) -> SubjectData:
+    def load(name: str, request: DataRequest) -> SubjectData:
         if name != "toy":
             raise UserError(f"no built-in subject '{name}'")
         return holder[0]

@@ -1,0 +1,50 @@
+"""All data sets by name."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from snarfcli.datasets import builtin, cape, clothed, dfaust, meshes, poseprior, stick2d
+from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.subjects import SubjectData
+from snarfcli.errors import UserError, nearest
+
+__all__ = ["DataSet", "find_dataset"]
+
+
+class DataSet(Protocol):
+    """Interface of a module that reads one data set."""
+
+    def subjects(self, request: DataRequest) -> tuple[str, ...]:
+        """Return the ids of the available subjects."""
+        ...
+
+    def load(self, subject: str, request: DataRequest) -> SubjectData:
+        """Return one subject.
+
+        Raises:
+            UserError: it is missing or cannot be used.
+        """
+        ...
+
+
+_DATASETS: dict[str, DataSet] = {
+    "builtin": builtin,
+    "cape": cape,
+    "clothed": clothed,
+    "dfaust": dfaust,
+    "meshes": meshes,
+    "poseprior": poseprior,
+    "stick2d": stick2d,
+}
+
+
+def find_dataset(name: str) -> DataSet:
+    """Return the module that reads the data set of a name.
+
+    Raises:
+        UserError: there is no such data set.
+    """
+    if name not in _DATASETS:
+        raise UserError(f"no data set '{name}'{nearest(name, _DATASETS)}; wanted one of {', '.join(_DATASETS)}")
+    return _DATASETS[name]

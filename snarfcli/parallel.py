@@ -13,7 +13,7 @@ import os
 import pickle
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -166,7 +166,7 @@ def end_workers(workers: Sequence[Worker]) -> None:
 
 def run_in_processes(
     function: Callable[..., Iterable[Any]], tasks: Iterable[tuple[Any, ...]], workers: int
-) -> Iterator[tuple[int, Any]]:
+) -> Generator[tuple[int, Any], None, None]:
     """Run `function(*task)` for every task, each in a fresh single-threaded process, and yield what it yields.
 
     Args:

@@ -1,11 +1,11 @@
-"""Progress of long work: a bar on a terminal, one line now and then in a log."""
+"""Progress of long tasks: a bar on a terminal, one line every 20 seconds in a log."""
 
 from __future__ import annotations
 
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from typing import TypeVar
 
 __all__ = ["progress"]
@@ -16,14 +16,16 @@ _LOG_EVERY_S = 20.0
 
 
 def progress(items: Iterable[_Item], *, total: int | None = None, desc: str, unit: str = "it") -> Iterator[_Item]:
-    """Yield `items` and report how far it is: tqdm on a terminal, else a line every 20 seconds.
+    """Yield `items` and report the progress: tqdm on a terminal, otherwise one line every 20 seconds.
 
     Args:
+        items: any items.
         total: number of items, if `items` has no length.
-        desc: what is being done, such as "preprocess 50002".
+        desc: name of the task, such as "preprocess 50002".
+        unit: name of one item.
     """
-    if total is None and hasattr(items, "__len__"):
-        total = len(items)  # type: ignore[arg-type]
+    if total is None and isinstance(items, Sized):
+        total = len(items)
     if sys.stderr.isatty():
         from tqdm import tqdm
 

@@ -42,7 +42,7 @@ def _answer(factor: int, requests: Iterator[int]) -> Iterator[int]:
 
 
 def _deaf() -> Iterator[bytes]:
-    """Passes over the signal that should end it, as happens where Python ignores exceptions, and fills the pipe."""
+    """Ignores the signal that should end it, as happens where Python ignores exceptions, and fills the pipe."""
     signal.signal(signal.SIGTERM, lambda *_: None)
     while True:
         yield bytes(1 << 20)
@@ -55,7 +55,7 @@ def test_a_process_that_is_deaf_to_signals_ends_too() -> None:
     assert not multiprocessing.active_children()
 
 
-def test_every_task_has_a_process_of_its_own_and_keeps_its_order() -> None:
+def test_every_task_has_its_own_process_and_keeps_its_order() -> None:
     items: dict[int, list] = {}
     for task, item in run_in_processes(_count, [(0, 3), (10, 10), (5, 7)], 2):
         items.setdefault(task, []).append(item)
@@ -80,10 +80,10 @@ def test_a_failure_reaches_the_caller(kind: str, error: type[Exception], message
 
 class _Unreadable:
     def __reduce__(self):
-        return _refuse, ()
+        return _fail_to_load, ()
 
 
-def _refuse() -> None:
+def _fail_to_load() -> None:
     raise UserError("cannot be read there")
 
 

@@ -1,4 +1,4 @@
-"""A viewer of the toy avatar whose clock the test turns, and which waits for surfaces without sleeping."""
+"""A viewer of the toy avatar with a clock set by the test; it waits for surfaces without sleeping."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SMALL = ViewerLook(skinned_resolution=24, field_resolution=24)
 
 
 class Watched:
-    """What a page would do: look at the picture whenever it is woken."""
+    """A viewer without a page, whose pictures a test asks for."""
 
     def __init__(self, avatar: ToyAvatar | None = None, look: ViewerLook = SMALL) -> None:
         self.now = 0.0
@@ -27,7 +27,7 @@ class Watched:
         return self.state.picture()[0]
 
     def settled(self) -> Picture:
-        """Return the picture once nothing more is being made."""
+        """Return the picture once all surfaces are computed."""
         while True:
             self.woken.clear()
             picture = self.picture()

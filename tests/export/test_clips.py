@@ -1,4 +1,4 @@
-"""Clips on the ground."""
+"""Clips placed on the ground."""
 
 from __future__ import annotations
 

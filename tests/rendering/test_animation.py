@@ -1,4 +1,4 @@
-"""Frames on several processes: the same as on one, in order, and a clear end when a process is lost."""
+"""Frames made on several processes: equal to those of one, in order, and a clear error when a process is killed."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def test_wrong_arguments_are_named():
         render(ball(), Camera((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 32)
 
 
-def test_what_was_prepared_draws_the_same_picture():
+def test_a_prepared_backdrop_gives_the_same_picture():
     mesh, other = ball(), ball(center=(0.3, 0.6, 0.1))
     camera = Camera.framing(mesh.vertices, margin=0.2)
     backdrop = Backdrop(camera, (64, 48), Floor(-0.1), Look())
@@ -125,7 +125,7 @@ def test_lines_on_the_floor_are_faint_and_stay_where_they_are():
     assert darker.min() >= 0
     assert 1 < darker.max() < 25
     assert 0.01 < (darker > 1).mean() < 0.2
-    # a line lies under the world's own multiples of the spacing, whatever the camera looks at
+    # lines lie at multiples of the spacing in world coordinates, for any camera
     for x in (0.25, -0.5):
         column, row, _ = camera.project(np.array([[x, 0.0, 0.125]]), 160, 160)[0]
         around = darker[int(row), int(column) - 1 : int(column) + 2]

@@ -11,7 +11,7 @@ from snarfcli.viewer.joints import vector_of
 
 
 class Slider:
-    """As viser's, moved by nobody or by somebody."""
+    """Like a slider of viser, set by the program or moved by a client."""
 
     def __init__(self, *_: object, **__: object) -> None:
         self.value = 0.0
@@ -21,7 +21,7 @@ class Slider:
 
     def move(self, value: float) -> None:
         self.value = value
-        self._updated(SimpleNamespace(client="somebody", target=self))
+        self._updated(SimpleNamespace(client="a client", target=self))
 
 
 class Joint:
@@ -43,7 +43,7 @@ class Joint:
         return turn.magnitude() < 1e-9
 
 
-def test_one_slider_changes_one_angle_of_the_pose_whatever_the_others_show():
+def test_one_slider_changes_one_angle_of_the_pose_also_if_the_others_are_outdated():
     joint = Joint()
     joint.vector = vector_of((12.34, -30.0, 56.78))  # by a motion that plays
     assert joint.shown == [0, 0, 0]

@@ -86,7 +86,7 @@ def test_the_shape_beside_stands_on_the_floor_wherever_that_is(scene, watched):
     assert feet == pytest.approx(watched.state.floor_y)
 
 
-def test_the_handle_follows_the_joint_unless_somebody_holds_it(scene, watched):
+def test_the_handle_follows_the_joint_unless_a_client_drags_it(scene, watched):
     straight, quarter = np.array([1.0, 0, 0, 0]), np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
     watched.state.change_look(shows_skeleton=True)
     scene.chosen_joint = 1
@@ -96,9 +96,7 @@ def test_the_handle_follows_the_joint_unless_somebody_holds_it(scene, watched):
     scene.turn_chosen(quarter, is_over=True, client_id=4)
     show_settled(scene, watched)
     np.testing.assert_allclose(watched.state.posed.pose[1], (0, 0, np.pi / 2), atol=1e-6)
-    np.testing.assert_allclose(
-        scene._skeleton_nodes.handle.wxyz, straight, atol=1e-6
-    )  # as on the page that turns it
+    np.testing.assert_allclose(scene._skeleton_nodes.handle.wxyz, straight, atol=1e-6)  # as on the page that turns it
     scene.let_go(3)
     show_settled(scene, watched)
     np.testing.assert_allclose(scene._skeleton_nodes.handle.wxyz, quarter, atol=1e-6)

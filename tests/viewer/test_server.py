@@ -173,7 +173,7 @@ def test_a_click_chooses_a_joint_and_the_handle_turns_it():
             page.until(lambda message: message["type"] == "TransformControlsMessage")
             server.controls.pose.choose_joint(2)
             assert server.controls.pose.joint == server.scene.chosen_joint == 2
-            server.controls.pose.choose_joint(0)  # the root has sliders of its own
+            server.controls.pose.choose_joint(0)  # the root has its own sliders
             assert server.controls.pose.joint == 2
             server.controls.pose.choose_joint(1)
             quarter = np.sqrt(0.5)

@@ -1,4 +1,4 @@
-"""What is to be seen follows from what was chosen: without a page, with a clock that the test turns."""
+"""The picture for a state of the viewer: without a page, with a clock set by the test."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ def test_the_canonical_shape_follows_while_a_field_plays(watched, monkeypatch):
         watched.state.load_motion(bending(16, rate=40.0))
         watched.state.play()
         worker.kinds.clear()
-        for watched.now in 0.026 * np.arange(1, 9):  # a frame each; a tenth of a second at least between two shapes
+        for watched.now in 0.026 * np.arange(1, 9):  # one frame each; at least 0.1 s between two shapes
             watched.picture()
         assert worker.kinds == [*[FieldRequest] * 3, ShapeRequest] * 2
 

@@ -24,7 +24,8 @@ from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
 from snarfcli.files import write_json
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
-from snarfcli.samples.store import SampleStore, samples_folder
+from snarfcli.samples.layout import samples_folder
+from snarfcli.samples.store import SampleStore
 
 __all__ = ["EvalConfig", "run"]
 

@@ -16,7 +16,8 @@ from snarfcli.datasets.clothed import ClothedBody, ClothedMeshes
 from snarfcli.datasets.posed_meshes import BodyMeshes
 from snarfcli.errors import UserError
 from snarfcli.motions.layouts import SMPL, layout_of
-from snarfcli.samples.store import SampleStore, SequenceSamples
+from snarfcli.samples.sequence import SequenceSamples
+from snarfcli.samples.store import SampleStore
 
 __all__ = ["StoredMeshes", "ground_truth_meshes"]
 

@@ -29,7 +29,8 @@ from snarfcli.models.start_bones import with_start_bones
 from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
-from snarfcli.samples.store import SampleStore, samples_folder
+from snarfcli.samples.layout import samples_folder
+from snarfcli.samples.store import SampleStore
 from snarfcli.shape import CONDITIONS, ConditionConfig, ShapeConfig
 from snarfcli.training.loop import train
 from snarfcli.training.losses import JOINT_TARGETS

@@ -13,7 +13,7 @@ from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import FrameMetrics, in_box, iou
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
-from snarfcli.samples.store import SequenceSamples
+from snarfcli.samples.sequence import SequenceSamples
 
 __all__ = ["choose_frames", "choose_points", "evaluate", "measure_frame", "predict_inside"]
 

@@ -20,7 +20,7 @@ from snarfcli.progress import progress
 from snarfcli.rendering.camera import Camera
 from snarfcli.rendering.render import render
 from snarfcli.rendering.sheet import contact_sheet, write_png
-from snarfcli.samples.store import SequenceSamples
+from snarfcli.samples.sequence import SequenceSamples
 
 __all__ = ["EXTRA", "MISSING", "choose_extremes", "draw_frame", "write_figure"]
 

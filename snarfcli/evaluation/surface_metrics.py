@@ -20,7 +20,7 @@ from snarfcli.evaluation.evaluate import choose_frames
 from snarfcli.meshing.surfaces import field_surface
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
-from snarfcli.samples.store import SequenceSamples
+from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.sampling.triangles import area_normals, random_points_in
 
 __all__ = ["F_SCORE_DISTANCE_M", "SurfaceMetrics", "compare_surfaces", "measure_surfaces", "sample_surface", "surfaces_text"]

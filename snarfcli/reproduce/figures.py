@@ -22,7 +22,8 @@ from snarfcli.rendering import Camera, contact_sheet, render, write_png
 from snarfcli.reproduce.experiments import Row
 from snarfcli.reproduce.plans import Plan
 from snarfcli.reproduce.results import COLUMNS, Result, summarise
-from snarfcli.samples.store import SampleStore, SequenceSamples
+from snarfcli.samples.sequence import SequenceSamples
+from snarfcli.samples.store import SampleStore
 
 __all__ = ["draw_sequences", "draw_stick_curves", "draw_stick_shapes", "draw_systems", "draw_weights"]
 

@@ -16,7 +16,7 @@ from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.locks import locked
 from snarfcli.reproduce.plans import EvaluationStage, Job
-from snarfcli.samples.store import samples_folder
+from snarfcli.samples.layout import samples_folder
 
 __all__ = ["LOG", "STATUS", "JobStatus", "JobStopped", "is_evaluated", "read_status", "run_command", "run_job"]
 

@@ -19,7 +19,7 @@ from snarfcli.hydra_config.schema import group_options
 from snarfcli.reproduce.experiments import EXPERIMENTS, Experiment, Row
 from snarfcli.reproduce.plans import EvaluationStage, ExperimentOptions, Job, Plan, SamplesStage
 from snarfcli.runs import run_folder
-from snarfcli.samples.store import samples_folder
+from snarfcli.samples.layout import samples_folder
 
 __all__ = ["choose_experiments", "make_plan"]
 

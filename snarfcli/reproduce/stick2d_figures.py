@@ -14,7 +14,8 @@ from snarfcli.evaluation.evaluate import predict_inside
 from snarfcli.evaluation.metrics import iou
 from snarfcli.files import atomic_path
 from snarfcli.models.trained_field import TrainedField
-from snarfcli.samples.store import SampleStore, SequenceSamples
+from snarfcli.samples.sequence import SequenceSamples
+from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import in_turned_over, winding_numbers
 
 if TYPE_CHECKING:

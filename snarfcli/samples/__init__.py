@@ -1,1 +1,1 @@
-"""The store of processed samples: how samples are made from posed meshes, written, found again and read."""
+"""The store of processed samples: how samples are made from posed meshes, written, found and read."""

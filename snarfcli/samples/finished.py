@@ -1,4 +1,4 @@
-"""What of a subject's samples is there already, and what a sequence's samples are made from."""
+"""Detect the finished sequences of a subject, and check that they were made from the same data."""
 
 from __future__ import annotations
 
@@ -8,26 +8,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from snarfcli.bodies import Skeleton, invert_rigid
-from snarfcli.datasets.subjects import SequenceSpec, SubjectData
+from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, read_npz
-from snarfcli.samples.store import SEQUENCE_FILES
+from snarfcli.samples.frames import frame_arrays, frame_numbers
+from snarfcli.samples.layout import SEQUENCE_FILES
 from snarfcli.samples.writing import settings_digest, write_arrays
 from snarfcli.sampling import check_mesh
 
-__all__ = ["complete_sequences", "frame_arrays", "frame_numbers", "write_subject"]
+__all__ = ["complete_sequences", "write_subject"]
 
 log = logging.getLogger(__name__)
 
-_POSE_TOLERANCE = 1e-4  # radians and metres; the same motion on another machine differs by rounding only
-_ANEW = "delete it to make it anew, or give overwrite=true"
+_POSE_TOLERANCE = 1e-4  # radians and metres; on another machine the same motion differs only by rounding
+_ADVICE = "delete it to make it again, or give overwrite=true"
 
 
 def write_subject(folder: Path, subject: SubjectData, inside_test: str) -> None:
-    """Write `subject.npz`, or check that the one there is of the same subject."""
+    """Write `subject.npz`; if it exists, check that it describes the same subject.
+
+    Args:
+        folder: folder of the subject's samples.
+        subject: the subject.
+        inside_test: the inside test of the samples; some require a closed mesh.
+
+    Raises:
+        UserError: the file that exists is damaged or differs, or the mesh of the subject cannot be used.
+    """
     skeleton, template = subject.skeleton, subject.template
     arrays = {
         "names": np.array(skeleton.names),
@@ -40,7 +48,7 @@ def write_subject(folder: Path, subject: SubjectData, inside_test: str) -> None:
         boundary_edges = check_mesh(template.vertices, template.faces, inside_test, f"the mesh of subject {subject.subject}")
         if boundary_edges:
             log.warning(
-                "the mesh of subject %s is open, %d boundary edges: labelled by winding number, inside is above a half",
+                "the mesh of subject %s is open, %d boundary edges: labelled by winding number, inside is above 0.5",
                 subject.subject, boundary_edges,
             )  # fmt: skip
         arrays |= {
@@ -71,12 +79,23 @@ def write_subject(folder: Path, subject: SubjectData, inside_test: str) -> None:
 def complete_sequences(
     folder: Path, subject: SubjectData, settings: Mapping[str, Any], frame_steps: Mapping[str, int]
 ) -> dict[tuple[str, str], dict[str, Any]]:
-    """Return the descriptions of the sequences that need not be made again, by split and name."""
+    """Return the descriptions of the finished sequences by split and name; damaged ones are left out.
+
+    Args:
+        folder: folder of the subject's samples.
+        subject: the subject.
+        settings: settings of the samples.
+        frame_steps: per split, the step between sampled frames.
+
+    Raises:
+        UserError: a sequence was made from another motion or from other meshes.
+    """
     done = {}
     for spec in subject.sequences:
         place = folder / spec.split / spec.name
         if not (place / "sequence.json").exists():
             continue
+        entry, there = {}, {}
         try:
             entry = read_json(place / "sequence.json", "samples")
             sizes = {name: entry["files"][name]["bytes"] for name in SEQUENCE_FILES}
@@ -96,39 +115,8 @@ def complete_sequences(
             if there[name].shape != array.shape or not np.allclose(there[name], array, rtol=0.0, atol=_POSE_TOLERANCE)
         ]
         if not differs and entry.get("source") != spec.meshes.fingerprint():
-            raise UserError(f"{place} was made from other meshes (the files have changed); {_ANEW}")
+            raise UserError(f"{place} was made from other meshes (the files have changed); {_ADVICE}")
         if differs:
-            raise UserError(f"{place} was made from another motion ({differs[0]} differs); {_ANEW}")
+            raise UserError(f"{place} was made from another motion ({differs[0]} differs); {_ADVICE}")
         done[spec.split, spec.name] = entry
     return done
-
-
-def frame_numbers(spec: SequenceSpec, frame_steps: Mapping[str, int]) -> np.ndarray:
-    """Return the numbers of the frames to sample."""
-    if spec.frames is not None:
-        return np.asarray(spec.frames, np.int64)
-    return np.arange(0, spec.motion.num_frames, frame_steps[spec.split])
-
-
-def frame_arrays(skeleton: Skeleton, spec: SequenceSpec, frames: np.ndarray) -> dict[str, np.ndarray]:
-    """Return what `frames.npz` says about the chosen frames: float32, metres and radians."""
-    skeleton = skeleton.to(torch.float64)
-    pose = torch.from_numpy(spec.motion.poses[frames])
-    translation = torch.from_numpy(spec.motion.translation[frames])
-    if spec.posed_from_rest is None:
-        posed_from_rest = skeleton.posed_from_rest(pose, translation)
-    else:
-        posed_from_rest = torch.from_numpy(spec.posed_from_rest[frames])
-    canonical_from_rest = skeleton.posed_from_rest(skeleton.canonical_pose[None])
-    joints = torch.einsum("tjrc,jc->tjr", posed_from_rest[..., :3, :3], skeleton.joints_rest) + posed_from_rest[..., :3, 3]
-    arrays = {
-        "poses": pose,
-        "translation": translation,
-        "posed_from_canonical": posed_from_rest @ invert_rigid(canonical_from_rest),
-        "joints": joints,
-    }
-    for name, array in arrays.items():
-        bad = np.flatnonzero(~array.isfinite().flatten(1).all(1).numpy())
-        if len(bad):
-            raise UserError(f"{spec.name} has NaN or infinite {name} in frame {frames[bad[0]]}; repair its poses first")
-    return {name: array.numpy().astype(np.float32) for name, array in arrays.items()} | {"frame_numbers": frames}

@@ -1,4 +1,4 @@
-"""From a subject's motions to its store of samples: pose the meshes, sample them on several processes, write and resume."""
+"""Preprocess a subject: pose its meshes, sample them in several processes, and write the samples; can be resumed."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from typing import Any
 
 import numpy as np
 
+from snarfcli.datasets.splits import SPLITS
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.errors import UserError, nearest
 from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
-from snarfcli.samples.finished import complete_sequences, frame_arrays, frame_numbers, write_subject
-from snarfcli.samples.store import samples_folder
+from snarfcli.samples.finished import complete_sequences, write_subject
+from snarfcli.samples.frames import frame_arrays, frame_numbers
+from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.writing import (
     SequenceWriter,
     discard_samples,
     hold_folder,
-    refuse_other_settings,
     remove_leftovers,
+    require_same_settings,
     write_manifest,
 )
 from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, sample_frames
@@ -32,13 +34,13 @@ __all__ = ["preprocess_subject"]
 
 log = logging.getLogger(__name__)
 
-_FRAMES_PER_TASK = 30  # 3 to 4 s of work for 0.4 s of starting a process; the samples depend on it, see snarfcli/parallel.py
-_FRAMES_CHECKED = 200  # that a process only reads
+_FRAMES_PER_TASK = 30  # 3 to 4 s of work per 0.4 s to start a process; the samples depend on it, see snarfcli/parallel.py
+_FRAMES_PER_CHECK = 200  # per process that only reads
 
 
 @dataclass
 class _Job:
-    """One sequence that is being made."""
+    """A sequence in progress."""
 
     spec: SequenceSpec
     arrays: dict[str, np.ndarray]
@@ -58,22 +60,22 @@ def preprocess_subject(
     sequences: Sequence[str] = (),
     skip_broken: bool = False,
 ) -> dict[str, Any]:
-    """Make the samples of one subject, or those that are still missing, and return the manifest.
+    """Make the missing samples of one subject, and return the manifest.
 
     Args:
         subject: skeleton and sequences.
         root: the data folder; the samples go under `processed/{data}/{subject}`.
-        sampling: how points are chosen and labelled.
-        frame_steps: for each split, every how many frames of the motion one is taken.
+        sampling: settings of the points and their labels.
+        frame_steps: per split, the step between sampled frames of a motion.
         workers: number of processes.
-        overwrite: discard the samples that are there.
-        sequences: names of the sequences to make, all if empty.
-        skip_broken: leave out sequences that cannot be used, and say so, instead of stopping.
+        overwrite: delete existing samples first.
+        sequences: names of the sequences to make; all if empty.
+        skip_broken: leave out sequences that cannot be used, with a warning, instead of raising.
 
     Raises:
-        UserError: the samples there were made with other settings or from other motion, a sequence is unknown or cannot be
-            used, or another process works in the same folder.
-        OSError: the disk is full or cannot be written to. Sequences that were complete stay; nothing half-made does.
+        UserError: existing samples were made with other settings or from other motion, a sequence is unknown or cannot be
+            used, or another process is working in the same folder.
+        OSError: the disk is full or cannot be written to. Complete sequences are kept, partial ones are deleted.
     """
     broken = _report_broken(subject, sequences, skip_broken)
     chosen = _choose(subject, sequences)
@@ -81,7 +83,7 @@ def preprocess_subject(
     settings = {
         "data": subject.data,
         "subject": subject.subject,
-        # said of planar subjects only, so that the settings of others are those that their samples were made with before
+        # written for planar subjects only, so that other subjects keep the settings of their existing samples
         **{name: value for name, value in vars(sampling).items() if name != "is_planar" or value},
         **{f"{split}_frame_step": step for split, step in frame_steps.items()},
     }
@@ -95,17 +97,17 @@ def preprocess_subject(
             chosen = [spec for spec in chosen if spec.name not in dict(unusable)]
             if overwrite:
                 discard_samples(folder)
-            refuse_other_settings(folder, settings)
+            require_same_settings(folder, settings)
             started = time.monotonic()
             write_subject(folder, subject, sampling.inside_test)
             done = complete_sequences(folder, subject, settings, frame_steps)
             missing = [spec for spec in chosen if (spec.split, spec.name) not in done]
             if len(missing) < len(chosen):
-                log.info("%d of %d sequences are there already", len(chosen) - len(missing), len(chosen))
+                log.info("%d of %d sequences exist already", len(chosen) - len(missing), len(chosen))
             made = _make_sequences(folder, subject, missing, sampling, settings, workers, broken if skip_broken else None)
             done.update({(entry["split"], entry["name"]): entry for entry in made})
             if not done:
-                raise UserError(f"subject {subject.subject} of {subject.data} data has no sequence that can be used")
+                raise UserError(f"subject {subject.subject} of {subject.data} data has no usable sequence; name others")
             seconds = time.monotonic() - started
             entries = [done[spec.split, spec.name] for spec in subject.sequences if (spec.split, spec.name) in done]
             header = {
@@ -121,18 +123,18 @@ def preprocess_subject(
         except BaseException as error:
             remove_leftovers(folder)
             if isinstance(error, OSError) and error.errno is not None and error.filename is None:
-                error.filename = str(folder)  # a write to a full disk does not say where
+                error.filename = str(folder)  # a write to a full disk does not name the file
             raise
     _report(manifest, sum(entry["frames"] for entry in made), sampling.points_per_frame, seconds)
     return manifest
 
 
 def _report_broken(subject: SubjectData, names: Sequence[str], skip_broken: bool) -> list[tuple[str, str]]:
-    """Return the sequences that the data set could not read, among those asked for; refuse them unless they may be left out."""
+    """Return the requested sequences that the data set could not read; raise UserError if they may not be left out."""
     broken = [(name, reason) for name, reason in subject.broken if not names or name in names]
     if broken and not skip_broken:
         name, reason = broken[0]
-        more = f" ({len(broken) - 1} more like it)" if len(broken) > 1 else ""
+        more = f" (and {len(broken) - 1} more)" if len(broken) > 1 else ""
         raise UserError(f"sequence {name} cannot be used: {reason}{more}; give skip_broken=true to leave such sequences out")
     for name, reason in broken:
         log.warning("left out: sequence %s (%s)", name, reason)
@@ -147,16 +149,16 @@ def _check_files(
     workers: int,
     skip_broken: bool,
 ) -> list[tuple[str, str]]:
-    """Read every mesh that comes from a file once, before any other work: return the sequences that cannot be used, and why.
+    """Read every mesh file once before other work, and return the sequences that cannot be used, with the reason.
 
     Raises:
-        UserError: there is one, and such sequences may not be left out.
+        UserError: there is one, and it may not be left out.
     """
     frames = {spec.name: frame_numbers(spec, frame_steps) for spec in specs if spec.meshes.source(0)}
     parts = [
-        (spec, frames[spec.name][start : start + _FRAMES_CHECKED])
+        (spec, frames[spec.name][start : start + _FRAMES_PER_CHECK])
         for spec in specs
-        for start in range(0, len(frames.get(spec.name, ())), _FRAMES_CHECKED)
+        for start in range(0, len(frames.get(spec.name, ())), _FRAMES_PER_CHECK)
     ]
     if not parts:
         return []
@@ -196,13 +198,13 @@ def _make_sequences(
     workers: int,
     broken: list[tuple[str, str]] | None,
 ) -> list[dict[str, Any]]:
-    """Sample and write sequences; each appears when its last frame is in. Return their descriptions.
+    """Sample and write sequences, and return their descriptions.
 
-    One that turns out to be unusable is added to `broken`, or is an error if that is None.
+    Sequences that cannot be used are added to `broken`; if that is None, they raise UserError.
     """
-    steps = {split: settings[f"{split}_frame_step"] for split in ("train", "test", "ood")}
+    steps = {split: settings[f"{split}_frame_step"] for split in SPLITS}
     jobs: list[_Job] = []
-    places: list[tuple[_Job, int]] = []  # of each task: its sequence, and the next frame that it will send
+    places: list[tuple[_Job, int]] = []  # per task: its sequence, and the next frame that it returns
 
     def tasks() -> Iterator[tuple[Any, ...]]:
         for spec in specs:
@@ -235,6 +237,7 @@ def _make_sequences(
                     job.writer.discard()
             if job.is_broken:
                 continue
+            assert not isinstance(samples, BrokenFrame)
             job.writer.write_frame(frame, samples)
             job.frames_left -= 1
             if job.frames_left == 0:
@@ -263,7 +266,9 @@ def _report_sequence(entry: Mapping[str, Any]) -> None:
         100 * entry["inside_share"], 100 * entry["self_intersecting_share"], open_mesh,
     )  # fmt: skip
     if entry["inside_share"] == 0:
-        log.warning("warning: no point of %s is inside; are its meshes surfaces of a body, with faces outward?", entry["name"])
+        log.warning(
+            "warning: no point of %s is inside; check that its meshes are surfaces of a body, with faces outward", entry["name"]
+        )
 
 
 def _report(manifest: Mapping[str, Any], frames: int, points_per_frame: int, seconds: float) -> None:
@@ -275,7 +280,7 @@ def _report(manifest: Mapping[str, Any], frames: int, points_per_frame: int, sec
             frames, frames * points_per_frame, seconds, frames / seconds, frames * points_per_frame / seconds,
         )  # fmt: skip
     log.info(
-        "subject %s of %s data: %d train, %d test, %d ood frames, %.1f MB on disk, %.0f bytes a frame",
+        "subject %s of %s data: %d train, %d test, %d ood frames, %.1f MB on disk, %.0f bytes per frame",
         manifest["subject"], manifest["data"], counts["train"], counts["test"], counts["ood"],
         manifest["bytes"] / 1e6, manifest["bytes"] / max(1, all_frames),
     )  # fmt: skip
@@ -283,6 +288,6 @@ def _report(manifest: Mapping[str, Any], frames: int, points_per_frame: int, sec
         log.warning("warning: no sequence is held out, so nothing can be evaluated; name some with data.test=[NAME]")
     if all(entry["boundary_edges"] == 0 for entry in manifest["sequences"]):
         log.info(
-            "self-intersecting: winding number and ray parity label %.3f %% of the points differently",
+            "self-intersecting: winding number and ray parity give different labels to %.3f %% of the points",
             100 * manifest["self_intersecting_share"],
         )

@@ -1,4 +1,4 @@
-"""The motion of a sequence of processed samples, to animate an avatar with that has no motions of its own."""
+"""Read the motion of a sequence of processed samples, for avatars whose skeleton the built-in motions do not fit."""
 
 from __future__ import annotations
 
@@ -9,34 +9,37 @@ from numpy.typing import NDArray
 from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError, nearest
 from snarfcli.motions import Motion
-from snarfcli.samples.store import SampleStore, SequenceSamples
+from snarfcli.samples.sequence import SequenceSamples
+from snarfcli.samples.store import SampleStore
 
 __all__ = ["stored_motion"]
 
-_APART = 1e-3  # of a bone transform's numbers, metres and turns: poses that come nearer say the same
+_TOLERANCE = 1e-3  # of the entries of a bone transform (metres, rotation): poses within it reproduce the transforms
 
 
 def stored_motion(
     root: str, data: str, subject: str, name: str | None, skeleton: Skeleton
 ) -> tuple[Motion, NDArray[np.float32] | None]:
-    """Return the motion of one sequence: poses and, where they do not say it all, bone transforms.
+    """Return the motion of one sequence: poses and, if they do not reproduce them, bone transforms.
 
     Args:
         root: the data folder.
-        data, subject: whose samples.
-        name: which sequence; None for the first that is held out, or else the first.
-        skeleton: the avatar's.
+        data: name of the data set.
+        subject: name of the subject.
+        name: name of the sequence; None for the first held-out one, or the first of all.
+        skeleton: skeleton of the avatar.
 
     Returns:
-        The motion, and its bone transforms [T, J, 4, 4], canonical to posed, metres, if the joints stretch; else None.
+        motion: poses and translation.
+        bone_transforms: [T, J, 4, 4], canonical to posed, metres, if the joints stretch; else None.
 
     Raises:
-        UserError: there are no samples, they are of another skeleton, or have no sequence of this name.
+        UserError: the samples are missing, have another skeleton, or no sequence of this name.
     """
     try:
         store = SampleStore.open(root, data, subject)
     except UserError as error:
-        raise UserError(f"no motion for this skeleton ({error}); or give a motion of its own by --pose FILE") from None
+        raise UserError(f"no motion for this skeleton ({error}); or give a motion by --pose FILE") from None
     if (store.skeleton.names, store.skeleton.parents) != (skeleton.names, skeleton.parents):
         raise UserError(f"the samples in {store.folder} are of another skeleton than the avatar; give a motion by --pose FILE")
     sequence = _choose(store, name)
@@ -45,11 +48,11 @@ def stored_motion(
     poses, translation = sequence.poses.astype(np.float64), sequence.translation.astype(np.float64)
     again = skeleton.posed_from_canonical(torch.from_numpy(poses), torch.from_numpy(translation)).numpy()
     apart = np.abs(again - sequence.bone_transforms).max()
-    return Motion(sequence.name, poses, translation, rate), sequence.bone_transforms if apart > _APART else None
+    return Motion(sequence.name, poses, translation, rate), sequence.bone_transforms if apart > _TOLERANCE else None
 
 
 def _choose(store: SampleStore, name: str | None) -> SequenceSamples:
-    """Return a sequence by its name, or the first one of the held-out ones, the others, those for training."""
+    """Return the sequence of a name; None for the first in the order test, ood, train."""
     sequences = sorted(store.all_sequences, key=lambda sequence: ("test", "ood", "train").index(sequence.split))
     if name is None:
         return sequences[0]

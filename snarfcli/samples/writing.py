@@ -1,4 +1,4 @@
-"""Writing the store of processed samples: whole sequences or nothing, one kind of settings to a folder."""
+"""Write processed samples: complete sequences only, and the same settings for all samples of a folder."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
+from snarfcli.datasets.splits import SPLITS
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, file_digest, read_json, write_json
 from snarfcli.locks import try_lock
-from snarfcli.samples.store import FORMAT_VERSION, SEQUENCE_FILES, SPLITS, check_format
+from snarfcli.samples.layout import FORMAT_VERSION, SEQUENCE_FILES, check_format
 from snarfcli.sampling.points import FrameSamples
 
 __all__ = [
@@ -25,8 +26,8 @@ __all__ = [
     "describe_files",
     "discard_samples",
     "hold_folder",
-    "refuse_other_settings",
     "remove_leftovers",
+    "require_same_settings",
     "settings_digest",
     "write_arrays",
     "write_manifest",
@@ -37,26 +38,31 @@ _SPOOL = "meshes.spool"
 
 
 def settings_digest(settings: Mapping[str, Any]) -> str:
-    """Return a short name for settings: equal for equal settings, whatever their order."""
+    """Return a digest of settings that does not depend on their order."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def describe_files(folder: Path, names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Return the size and the SHA-256 of files, as a manifest lists them."""
+    """Return the entries of a manifest for files: size and SHA-256."""
     return {name: {"bytes": (folder / name).stat().st_size, "sha256": file_digest(folder / name)} for name in names}
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write an `.npz` archive, whole or not at all."""
+    """Write an `.npz` archive atomically."""
     with atomic_path(path) as temporary:
-        np.savez(temporary, **arrays)
+        np.savez(temporary, **arrays)  # pyright: ignore[reportArgumentType]  # stub: takes arrays for allow_pickle
 
 
 class SequenceWriter:
-    """Writes one sequence under a temporary name, frame by frame in any order; it appears when it is complete."""
+    """Writer of one sequence: frames in any order, under a temporary name until the sequence is complete."""
 
     def __init__(self, folder: Path, num_frames: int, num_points: int) -> None:
-        """Start the sequence that will be `folder`.
+        """Create the files of a sequence.
+
+        Args:
+            folder: folder of the finished sequence.
+            num_frames: number of frames.
+            num_points: number of points per frame.
 
         Raises:
             OSError: the folder cannot be written to.
@@ -69,28 +75,42 @@ class SequenceWriter:
         self._cubes = np.zeros((num_frames, 4), np.float32)
         self._boxes = np.zeros((num_frames, 2, 3), np.float32)
         self._inside = self._differing = self._boundary_edges = 0
-        self._topologies: dict[bytes, tuple[int, int, int]] = {}  # by digest: number, place in the spool, how many faces
+        # By digest: index, position in the spool, number of faces.
+        self._topologies: dict[bytes, tuple[int, int, int]] = {}
         self._topology = np.zeros(num_frames, np.int64)
-        self._spooled = np.zeros((num_frames, 2), np.int64)  # of each frame's vertices: their place in the spool, and how many
-        self._points = self._occupancies = self._spool = None
+        # Per frame: position of its vertices in the spool, and their number.
+        self._spooled = np.zeros((num_frames, 2), np.int64)
+        self._files = contextlib.ExitStack()
         try:
-            self._points, self._points_start = _start_array(self._partial / "points.npy", (*self._shape, 3), "<u2")
+            self._points, self._points_start = self._start_array("points.npy", (*self._shape, 3), "<u2")
             packed = (num_frames, num_points // 8)
-            self._occupancies, self._bits_start = _start_array(self._partial / "occupancies.npy", packed, "|u1")
-            self._spool = open(self._partial / _SPOOL, "w+b")
+            self._occupancies, self._bits_start = self._start_array("occupancies.npy", packed, "|u1")
+            self._spool = self._open(_SPOOL, "w+b")
         except BaseException:
             self.discard()
             raise
 
+    def _open(self, name: str, mode: str) -> IO[bytes]:
+        """Open a file of the unfinished sequence; `discard` closes it."""
+        file = open(self._partial / name, mode)  # noqa: SIM115 - stays open until the sequence is complete
+        self._files.callback(_close_quietly, file)
+        return file
+
+    def _start_array(self, name: str, shape: tuple[int, ...], dtype: str) -> tuple[IO[bytes], int]:
+        """Create a `.npy` file, and return it open with the position of its first value."""
+        file = self._open(name, "wb")
+        np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
+        return file, file.tell()
+
     def write_frame(self, frame: int, samples: FrameSamples) -> None:
-        """Write the points, the labels and the mesh of frame number `frame` of this sequence."""
+        """Write the points, the labels and the mesh of a frame."""
         num_points = self._shape[1]
-        # plain writes, not a memory map: a full disk is then an error that can be reported, not a bus error
+        # Plain writes instead of a memory map: a full disk is then an OSError, not a bus error.
         self._points.seek(self._points_start + frame * num_points * 6)
         self._points.write(np.ascontiguousarray(samples.points, "<u2").data)
         self._occupancies.seek(self._bits_start + frame * (num_points // 8))
         self._occupancies.write(np.packbits(samples.occupied).data)
-        # how many vertices the frames before this one have is not known yet, so they are put in order by `finish`
+        # The number of vertices of earlier frames may not be known yet, so `finish` puts them in order.
         self._spooled[frame] = self._spool.tell(), len(samples.vertices)
         self._spool.write(np.ascontiguousarray(samples.vertices, "<u8").data)
         self._topology[frame] = self._topology_of(samples.faces)
@@ -101,7 +121,7 @@ class SequenceWriter:
         self._boundary_edges = max(self._boundary_edges, samples.boundary_edges)
 
     def _topology_of(self, faces: np.ndarray) -> int:
-        """Return the number of a list of faces among those seen so far; a new one is spooled, as scans have one a frame."""
+        """Return the index of a list of faces among those written so far; new lists are spooled (scans have one per frame)."""
         content = np.ascontiguousarray(faces, "<i4")
         digest = hashlib.sha256(content.data).digest()
         if digest not in self._topologies:
@@ -110,17 +130,17 @@ class SequenceWriter:
         return self._topologies[digest][0]
 
     def finish(self, arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> dict[str, Any]:
-        """Complete the sequence once every frame is written, and return what its `sequence.json` says.
+        """Complete the sequence after all frames are written, and return the content of its `sequence.json`.
 
         Args:
-            arrays: what `frames.npz` holds besides cubes, boxes and where each mesh starts, [T, ...] each.
-            description: entries of `sequence.json` besides counts, shares and checksums; `settings` among them.
+            arrays: [T, ...] each, the arrays of `frames.npz` other than cubes, boxes and starts of meshes.
+            description: entries of `sequence.json` other than counts, shares and checksums; must include `settings`.
         """
         self._points.close()
         self._occupancies.close()
         vertex_start = self._write_spooled("vertices.npy", self._spooled, (), "<u8")
         _, first, topology = np.unique(self._topology, return_index=True, return_inverse=True)
-        order = np.argsort(first)  # the topologies in the order in which the frames have them
+        order = np.argsort(first)  # topologies in order of first use
         places = np.array([place for _, *place in self._topologies.values()])
         face_start = self._write_spooled("faces.npy", places[order], (3,), "<i4")
         self._spool.close()
@@ -148,9 +168,9 @@ class SequenceWriter:
         return complete
 
     def _write_spooled(self, name: str, places: np.ndarray, row: tuple[int, ...], dtype: str) -> np.ndarray:
-        """Write an array of parts of the spool, given by place and number of rows; return where each starts, and the end."""
+        """Write parts of the spool, given by position and number of rows, as one array; return their starts, and the end."""
         starts = np.concatenate([[0], np.cumsum(places[:, 1])])
-        file, _ = _start_array(self._partial / name, (int(starts[-1]), *row), dtype)
+        file, _ = self._start_array(name, (int(starts[-1]), *row), dtype)
         size = np.dtype(dtype).itemsize * math.prod(row)
         with file:
             for place, count in places:
@@ -159,32 +179,21 @@ class SequenceWriter:
         return starts
 
     def discard(self) -> None:
-        """Leave nothing of an unfinished sequence behind; harmless after `finish`."""
-        for file in (self._points, self._occupancies, self._spool):
-            if file is not None:
-                with contextlib.suppress(OSError):  # a full disk shows again when the buffer is flushed
-                    file.close()
+        """Delete the files of an unfinished sequence; has no effect after `finish`."""
+        self._files.close()
         shutil.rmtree(self._partial, ignore_errors=True)
 
 
-def _start_array(path: Path, shape: tuple[int, ...], dtype: str) -> tuple[Any, int]:
-    """Open a `.npy` file to be filled in, and return it with the position of its first value."""
-    file = open(path, "wb")
-    try:
-        header = {"descr": dtype, "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(file, header)
-        return file, file.tell()
-    except BaseException:
-        with contextlib.suppress(OSError):
-            file.close()
-        raise
+def _close_quietly(file: IO[bytes]) -> None:
+    with contextlib.suppress(OSError):  # a full disk raises again when the buffer is flushed
+        file.close()
 
 
-def refuse_other_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Refuse to add samples to a folder whose samples were made with other settings.
+def require_same_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Check that the samples in a folder were made with the same settings.
 
     Raises:
-        UserError: what is there differs; the message names each differing setting, or the format version.
+        UserError: they were not; the message names each setting that differs, or the format version.
     """
     for path in [folder / "manifest.json", *sorted(folder.glob("*/*/sequence.json"))]:
         if not path.exists():
@@ -202,8 +211,8 @@ def refuse_other_settings(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def discard_samples(folder: Path) -> None:
-    """Delete the samples in a subject's folder; files that are not ours stay."""
-    for name in ("manifest.json", "subject.npz"):  # the manifest first: without it there is no store
+    """Delete the samples in the folder of a subject; other files are kept."""
+    for name in ("manifest.json", "subject.npz"):  # the manifest first, since the store does not exist without it
         (folder / name).unlink(missing_ok=True)
     for split in SPLITS:
         if (folder / split).is_dir():
@@ -211,7 +220,7 @@ def discard_samples(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what an interrupted run left unfinished: partial sequences, a subject without sequences, empty folders."""
+    """Delete incomplete files of an interrupted run: partial sequences, a subject without sequences, empty folders."""
     for partial in folder.glob(f"*/.*{_PARTIAL}"):
         shutil.rmtree(partial, ignore_errors=True)
     if not any(folder.glob("*/*/sequence.json")):
@@ -233,7 +242,7 @@ def hold_folder(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     release = try_lock(folder.with_name(f".{folder.name}.preprocess.lock"))
     if release is None:
-        raise UserError(f"another snarf preprocess is working in {folder}; wait for it, or end it first")
+        raise UserError(f"another snarf preprocess is working in {folder}; wait for it, or end it")
     try:
         yield
     finally:
@@ -241,12 +250,12 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 
 def write_manifest(folder: Path, header: Mapping[str, Any], sequences: list[dict[str, Any]]) -> dict[str, Any]:
-    """Write the manifest of a subject, which makes its samples a store, and return it.
+    """Write the manifest of a subject, which completes its samples, and return it.
 
     Args:
-        folder: the subject's folder, with `subject.npz` in it.
-        header: `data`, `subject`, `settings` and whatever else says what made the samples.
-        sequences: contents of the `sequence.json` of each sequence, in the order of the data set.
+        folder: folder of the subject, with `subject.npz`.
+        header: first entries: `data`, `subject`, `settings` and the origin of the samples.
+        sequences: content of `sequence.json` of each sequence, in the order of the data set.
     """
     total = sum(entry["frames"] * entry["points_per_frame"] for entry in sequences)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from snarfcli.samples.store import SequenceSamples
+from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.sampling import in_turned_over, occupancies, outline_samples, uniform_surface_samples
 
 __all__ = ["DrawnPoints", "FreshPoints", "draw_steps"]

@@ -14,7 +14,7 @@ from snarfcli.datasets.cape_frames import CapeMeshes
 from snarfcli.datasets.posed_meshes import FileMeshes
 from snarfcli.formats.surfaces import read_surface
 
-_MODULES = ["cli.main", "datasets.cape_frames", "datasets.posed_meshes", "samples.store", "formats.surfaces"]
+_MODULES = ["cli.main", "datasets.cape_frames", "datasets.posed_meshes", "samples.sequence", "formats.surfaces"]
 
 
 @pytest.mark.parametrize("module", [f"snarfcli.{name}" for name in _MODULES])

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from snarfcli.errors import UserError
-from snarfcli.samples.store import FORMAT_VERSION, SampleStore, SequenceSamples, samples_folder
+from snarfcli.samples.layout import FORMAT_VERSION, samples_folder
+from snarfcli.samples.sequence import SequenceSamples
+from snarfcli.samples.store import SampleStore
 from snarfcli.samples.writing import (
     SequenceWriter,
     discard_samples,
     hold_folder,
-    refuse_other_settings,
     remove_leftovers,
+    require_same_settings,
     settings_digest,
     write_arrays,
     write_manifest,
@@ -213,10 +215,10 @@ def test_unknown_and_empty_splits(folder: Path) -> None:
 def test_another_format_version_is_refused(folder: Path, version: int | None) -> None:
     path = folder / "manifest.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": version}))
-    with pytest.raises(UserError, match=rf"version {version}, wanted {FORMAT_VERSION}\).*overwrite=true"):
+    with pytest.raises(UserError, match=rf"wanted format version {FORMAT_VERSION}, got {version};.*overwrite=true"):
         _open(folder)
     with pytest.raises(UserError, match="format"):
-        refuse_other_settings(folder, _SETTINGS)
+        require_same_settings(folder, _SETTINGS)
 
 
 @pytest.mark.parametrize("name", ["train/walk/points.npy", "train/walk/frames.npz", "test/hop/occupancies.npy", "subject.npz"])
@@ -249,10 +251,10 @@ def test_an_unfinished_sequence_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_other_settings_are_named(folder: Path) -> None:
-    refuse_other_settings(folder, _SETTINGS)
+    require_same_settings(folder, _SETTINGS)
     for _ in range(2):  # by the manifest, then by the sequences of an unfinished run
         with pytest.raises(UserError, match=r"other settings \(seed 0 -> 1, padding None -> 0.2\).*overwrite=true"):
-            refuse_other_settings(folder, {**_SETTINGS, "seed": 1, "padding": 0.2})
+            require_same_settings(folder, {**_SETTINGS, "seed": 1, "padding": 0.2})
         (folder / "manifest.json").unlink(missing_ok=True)
 
 

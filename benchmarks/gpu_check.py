@@ -29,7 +29,7 @@ import torch
 from rivals import released_search
 from torch import Tensor
 
-from snarfcli.deformer import CanonicalGrid, find_correspondences
+from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences
 from snarfcli.deformer.correspondences import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.native import cuda, cuda_compile, cuda_driver
@@ -37,7 +37,7 @@ from snarfcli.native import cuda, cuda_compile, cuda_driver
 ROOT = Path(__file__).resolve().parents[1]
 TEST = "tests/native/test_cuda.py"
 SCENES = ("knees", "arms_behind_back", "random joints")
-TOLERANCE, STEPS = 5e-6, 10  # find_correspondences' own
+TOLERANCE, STEPS = SearchConfig().tolerance, SearchConfig().max_steps
 BROYDEN_M = (1e-4, 0.5)  # the released thresholds, metres
 TARGET_OVER_BROYDEN, TARGET_BACKWARD = 10, 2
 NUMBERS = torch.float32
@@ -201,7 +201,7 @@ def compare(report: Report, chosen: list[Case]) -> None:
         same = all(torch.equal(a, b) for a, b in zip(found, again, strict=True))
         active = None if case.active is None else case.active.cpu()
         given = (case.points.cpu(), case.bones.cpu(), case.weights.cpu(), case.grid.to(case.points.cpu()))
-        wanted = find_correspondences(*given, active_cells=active, tolerance=TOLERANCE, max_steps=STEPS)
+        wanted = find_correspondences(*given, search=SearchConfig(tolerance=TOLERANCE, max_steps=STEPS), active_cells=active)
         total = case.points.shape[0] * case.points.shape[1]
         here, there = (torch.bincount(query.cpu(), minlength=total) for query in (found[1], wanted.query))
         equal = here == there

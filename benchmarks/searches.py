@@ -10,7 +10,7 @@ from rivals import released_search
 from scenes import Scene
 from torch import Tensor
 
-from snarfcli.deformer import find_correspondences
+from snarfcli.deformer import SearchConfig, find_correspondences
 from snarfcli.native.library import native_library
 
 __all__ = ["Found", "Method", "as_found", "methods"]
@@ -59,11 +59,12 @@ def methods(names: str | None = None) -> list[Method]:
 
 def _ours(backend: str, search: str = "complete", nine: bool = False) -> Callable:
     def run(points: Tensor, transforms: Tensor, scene: Scene, active: Tensor | None = None):
-        settings = {"active_cells": active if search == "complete" else None}
+        settings = SearchConfig(search, backend=backend)
         if search == "broyden":
-            settings = {name: value / scene.grid.longest_side for name, value in _BROYDEN_M.items()}
-            settings["init_bones"] = scene.init_bones if nine else None
-        return find_correspondences(points, transforms, scene.weights, scene.grid, search=search, backend=backend, **settings)
+            limits = {name: value / scene.grid.longest_side for name, value in _BROYDEN_M.items()}
+            settings = replace(settings, init_bones=list(scene.init_bones) if nine else None, **limits)
+        cells = active if search == "complete" else None
+        return find_correspondences(points, transforms, scene.weights, scene.grid, search=settings, active_cells=cells)
 
     return run
 

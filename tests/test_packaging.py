@@ -82,7 +82,7 @@ def test_the_wheel_runs_from_anywhere(wheel, tmp_path):
         tmp_path,
         f"assert snarfcli.__version__ == {stated!r}; "
         "from snarfcli.bodies import builtin_body; assert len(builtin_body().v_template) == 6890; "
-        "from snarfcli.native.library import choose_backend, library_path; "
+        "from snarfcli.native.backend import choose_backend; from snarfcli.native.library import library_path; "
         f"assert choose_backend('native') == 'native' and {str(tmp_path)!r} in str(library_path()); "
         "from snarfcli.cli.main import main; raise SystemExit(main(['train', '--cfg', 'job']))",
     )
@@ -97,10 +97,10 @@ def test_without_a_compiler_the_wheel_runs_on_the_reference_with_one_warning(tmp
     assert not [name for name in names if "libsnarf_native" in name]
     done = run_from(
         tmp_path / "site",
-        "import torch; from snarfcli.deformer import CanonicalGrid, find_correspondences; from snarfcli.native import library; "
+        "import torch; from snarfcli.deformer import CanonicalGrid, find_correspondences; from snarfcli.native import backend; "
         "grid = CanonicalGrid(torch.tensor([-1.0] * 3), torch.tensor([1.0] * 3)); points = torch.full((1, 5, 3), 0.3); "
         "found = [find_correspondences(points, torch.eye(4)[None, None], torch.ones(3, 3, 3, 1), grid) for _ in range(2)]; "
-        "assert found[1].query.tolist() == [0, 1, 2, 3, 4] and library.choose_backend('auto') == 'reference'",
+        "assert found[1].query.tolist() == [0, 1, 2, 3, 4] and backend.choose_backend('auto') == 'reference'",
     )
     assert done.returncode == 0, done.stderr
     warning = "no working C++ compiler was found when snarf was installed; install a C++17 compiler"
@@ -115,7 +115,7 @@ def test_a_source_that_does_not_compile_leaves_the_library_out(tmp_path):
     for kernel in copy.glob("csrc/cpu/kernel*.cpp"):
         kernel.write_text("")
     unpack(build_wheel(tmp_path / "wheel", copy), tmp_path / "site")
-    done = run_from(tmp_path / "site", "from snarfcli.native.library import choose_backend; choose_backend('auto')")
+    done = run_from(tmp_path / "site", "from snarfcli.native.backend import choose_backend; choose_backend('auto')")
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("Warning") == 1
     assert "reinstall snarf with a C++ compiler" in done.stderr

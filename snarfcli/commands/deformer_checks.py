@@ -4,37 +4,37 @@ from __future__ import annotations
 
 from snarfcli.checks import check_choice, check_number, check_positive
 from snarfcli.deformer import SearchConfig, SkinningConfig
-from snarfcli.deformer.deformer import FIELDS
 from snarfcli.deformer.hierarchy import SOFTMAXES
-from snarfcli.deformer.search_config import JACOBIANS, SEARCHES
+from snarfcli.deformer.search_config import BACKENDS, JACOBIANS, SEARCHES
+from snarfcli.deformer.skinning_config import FIELDS
 from snarfcli.errors import UserError
 
 __all__ = ["check_search", "check_skinning"]
 
 
 def check_search(search: SearchConfig) -> None:
-    """Refuse settings of the correspondence search that do not fit together; bones are checked where their number is known.
+    """Check the settings of the correspondence search; start bones are checked later, where the number of bones is known.
 
     Raises:
-        UserError: one does not fit.
+        UserError: a setting cannot be used.
     """
     check_choice("search.name", search.name, SEARCHES)
     check_choice("search.jacobian", search.jacobian, JACOBIANS)
-    check_choice("search.backend", search.backend, ("auto", "native", "reference"))
+    check_choice("search.backend", search.backend, BACKENDS)
     if search.name == "complete" and search.init_bones is not None:
         raise UserError("search.init_bones is for search=broyden; the complete search has no start bones")
     if search.name == "complete" and search.jacobian != "exact":
-        raise UserError("search.jacobian=broyden is for search=broyden; the complete search has the exact one at hand")
+        raise UserError("search.jacobian=broyden is for search=broyden; the complete search uses the exact Jacobian")
     check_number("search.max_steps", search.max_steps, 1)
     check_positive("search.tolerance", search.tolerance)
     check_positive("search.divergence", search.divergence)
 
 
 def check_skinning(skinning: SkinningConfig, search: SearchConfig) -> None:
-    """Refuse settings of the weight field that cannot be used, or that do not go with the search.
+    """Check the settings of the weight field, alone and together with the search.
 
     Raises:
-        UserError: one does not fit.
+        UserError: a setting cannot be used.
     """
     check_choice("skinning.name", skinning.name, FIELDS)
     check_choice("skinning.softmax", skinning.softmax, SOFTMAXES)
@@ -50,10 +50,12 @@ def check_skinning(skinning: SkinningConfig, search: SearchConfig) -> None:
     for name in ("sharpness", "prior_falloff_m"):
         check_positive(f"skinning.{name}", getattr(skinning, name))
     if skinning.smoothness and skinning.name != "voxel":
-        raise UserError("skinning.smoothness is for skinning=voxel; the other fields are smooth by themselves")
+        raise UserError("skinning.smoothness is for skinning=voxel; the other fields are smooth without it")
     if skinning.weights_file is not None and skinning.name != "preset":
         raise UserError("skinning.weights_file is for skinning=preset; the other fields are learned")
     if skinning.name == "preset" and skinning.weights_file is None:
         raise UserError("skinning=preset needs skinning.weights_file=FILE, an .npz file with vertices and weights")
     if skinning.name == "mlp" and search.name != "broyden":
-        raise UserError("skinning=mlp has no cells to search; leave search out, or give search=snarf or search=broyden")
+        raise UserError(
+            f"search: wanted snarf or broyden with skinning=mlp, got {search.name}; give one of them, or leave search out"
+        )

@@ -5,19 +5,21 @@ Usable alone, in any neural field: see `ForwardDeformer`.
 
 from snarfcli.deformer.cells import cells_near
 from snarfcli.deformer.correspondences import Correspondences, find_correspondences
-from snarfcli.deformer.deformer import ForwardDeformer, SkinningConfig
+from snarfcli.deformer.deformer import ForwardDeformer
 from snarfcli.deformer.diffusion import PresetWeights
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, skin
-from snarfcli.deformer.weights import BonePrior, WeightField
+from snarfcli.deformer.skinning_config import SkinningConfig
+from snarfcli.deformer.weights import BonePrior, NodeWeights, WeightField
 
 __all__ = [
     "BonePrior",
     "CanonicalGrid",
     "Correspondences",
     "ForwardDeformer",
+    "NodeWeights",
     "PresetWeights",
     "SearchConfig",
     "SkinningConfig",

@@ -1,4 +1,4 @@
-"""The bone transforms blended once per grid node, as a PyTorch operator of full precision."""
+"""Bone transforms blended once per grid node, as a torch.library operator in full precision."""
 
 from __future__ import annotations
 
@@ -6,28 +6,29 @@ import torch
 from torch import Tensor
 
 from snarfcli.native import cpu
-from snarfcli.native.library import choose_backend
+from snarfcli.native.backend import choose_backend
 from snarfcli.precision import matmul_precision
 
-__all__ = ["blend", "blend_backward", "refuse_second_derivative"]
+__all__ = ["blend", "blend_backward", "raise_for_second_derivative"]
 
 
 @torch.library.custom_op("snarf::blend", mutates_args=())
 def blend(weights: Tensor, bones: Tensor, active_cells: Tensor | None, backend: str) -> Tensor:
     """Blend bone transforms [B, J, 12] with the weights [D, H, W, J] of the grid's nodes to [B, D * H * W, 12].
 
-    In full precision, forward and backward, whatever precision the caller allows for matrix products: TF32 would move a point
-    by half a millimetre at one metre.
+    Runs in full precision, forward and backward, also where the caller allows TF32: that would move a point by half a
+    millimetre at one metre.
 
     Args:
-        active_cells: bool [D-1, H-1, W-1]; nodes that are no corner of an active cell need not be blended and get zeros, or
-            what they would have got.
+        active_cells: [D-1, H-1, W-1], bool. Nodes that are not a corner of an active cell may get zeros; None for all cells.
         backend: "auto", "native" or "reference".
 
     Source: Fast-SNARF Eq. 13.
     """
-    if not weights.is_cuda and choose_backend(backend) == "native":
-        return cpu.blend(weights, bones, active_cells)
+    return _blend_reference(weights, bones)
+
+
+def _blend_reference(weights: Tensor, bones: Tensor) -> Tensor:
     with matmul_precision("highest"), torch.autocast(weights.device.type, enabled=False):
         return torch.matmul(weights.reshape(1, -1, weights.shape[-1]), bones)
 
@@ -42,12 +43,16 @@ def blend_backward(
     wants_bones: bool,
     backend: str,
 ) -> tuple[Tensor, Tensor]:
-    """Return the gradients of a loss by the weights and by the bones from that by `blend`'s result; empty where not wanted.
+    """Return the gradients of a loss by the weights and by the bones, given its gradient by `blend`'s result.
 
-    The gradient by the result is taken to be zero at nodes that are no corner of an active cell.
+    A gradient that is not wanted is empty. The given gradient counts as zero at nodes that are not a corner of an active cell.
     """
-    if not weights.is_cuda and choose_backend(backend) == "native":
-        return cpu.blend_backward(gradient, weights, bones, active_cells, (wants_weights, wants_bones))
+    return _blend_backward_reference(gradient, weights, bones, wants_weights, wants_bones)
+
+
+def _blend_backward_reference(
+    gradient: Tensor, weights: Tensor, bones: Tensor, wants_weights: bool, wants_bones: bool
+) -> tuple[Tensor, Tensor]:
     flat = weights.reshape(-1, weights.shape[-1])
     v_weights, v_bones = weights.new_empty(0), bones.new_empty(0)
     with matmul_precision("highest"), torch.autocast(weights.device.type, enabled=False):
@@ -59,6 +64,21 @@ def blend_backward(
         if wants_bones:
             v_bones = torch.matmul(flat.T[None], gradient)
     return v_weights, v_bones
+
+
+# A matrix product is fast on other devices as it is: only the CPU has a native kernel.
+@blend.register_kernel("cpu")
+def _(weights, bones, active_cells, backend):
+    if choose_backend(backend) == "native":
+        return cpu.blend(weights, bones, active_cells)
+    return _blend_reference(weights, bones)
+
+
+@blend_backward.register_kernel("cpu")
+def _(gradient, weights, bones, active_cells, wants_weights, wants_bones, backend):
+    if choose_backend(backend) == "native":
+        return cpu.blend_backward(gradient, weights, bones, active_cells, (wants_weights, wants_bones))
+    return _blend_backward_reference(gradient, weights, bones, wants_weights, wants_bones)
 
 
 @blend.register_fake
@@ -73,7 +93,7 @@ def _(gradient, weights, bones, active_cells, wants_weights, wants_bones, backen
     return v_weights, bones.new_empty(bones.shape if wants_bones else 0)
 
 
-def _remember(ctx, inputs, output):
+def _save_for_backward(ctx, inputs, output):
     weights, bones, active_cells, ctx.backend = inputs
     ctx.save_for_backward(weights, bones, active_cells)
 
@@ -84,13 +104,13 @@ def _backward(ctx, gradient):
     return v_weights if wants[0] else None, v_bones if wants[1] else None, None, None
 
 
-def refuse_second_derivative(ctx, *gradients):
-    """Say why there is no second derivative; the gradient operators' own gradient."""
+def raise_for_second_derivative(ctx, *gradients):
+    """Raise RuntimeError: the gradient of a gradient operator."""
     raise RuntimeError(
         "the second derivative of a correspondence search is not available: its gradient is exact, but is itself computed "
         "without a graph; call backward() or autograd.grad() without create_graph=True"
     )
 
 
-blend.register_autograd(_backward, setup_context=_remember)
-blend_backward.register_autograd(refuse_second_derivative)
+blend.register_autograd(_backward, setup_context=_save_for_backward)
+blend_backward.register_autograd(raise_for_second_derivative)

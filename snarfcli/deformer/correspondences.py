@@ -1,4 +1,4 @@
-"""The public search: find every canonical correspondence of posed points, with exact implicit gradients."""
+"""Find every canonical correspondence of posed points, with exact implicit gradients."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.ops import broyden_search, complete_search
 from snarfcli.deformer.roots import invert_3x3
+from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
 from snarfcli.deformer.skinning import blend_transforms
 
 __all__ = ["Correspondences", "check_transforms", "find_correspondences"]
@@ -19,44 +20,44 @@ __all__ = ["Correspondences", "check_transforms", "find_correspondences"]
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Canonical correspondences of B x N posed points, compact: only real roots.
+    """Canonical correspondences of B x N posed points: the roots of all queries in one list.
 
-    Where a capacity was given, rows beyond the roots belong to no query; they hold zeros and the query B * N.
+    If a capacity was given, rows beyond the roots belong to no query; they hold zeros and the query B * N.
     """
 
     canonical: Tensor
     """[M, 3], metres; differentiable in the points, the skinning weights and the bone transforms."""
     query: Tensor
-    """Flat index b * N + n of each root's query, [M], ascending."""
+    """[M], index b * N + n of each root's query, ascending."""
     jacobian_inverse: Tensor
-    """Inverse of dd/dx at each root, [M, 3, 3]; carries no gradient."""
+    """[M, 3, 3], inverse of dd/dx at each root; has no gradient."""
     batch: int
-    """B."""
+    """B, number of poses."""
     count: int
-    """N."""
+    """N, number of queries per pose."""
     total: Tensor
-    """Number of roots found, [1]; more than M only where a capacity cut them."""
+    """[1], number of roots found; more than M only if a capacity cut them."""
 
     @property
     def pose(self) -> Tensor:
-        """Index b of each root's pose, [M]."""
+        """[M], index b of each root's pose."""
         return (self.query // max(self.count, 1)).clamp_max(max(self.batch - 1, 0))
 
     @property
     def found(self) -> Tensor:
-        """Which queries have a correspondence, bool [B, N]."""
+        """[B, N], bool, whether each query has a correspondence."""
         mask = torch.zeros(self.batch * self.count + 1, dtype=torch.bool, device=self.query.device)
         mask[self.query] = True
         return mask[:-1].reshape(self.batch, self.count)
 
     @property
     def counts(self) -> Tensor:
-        """How many correspondences each query has, [B, N]."""
+        """[B, N], number of correspondences per query."""
         counts = self.query.new_zeros(self.batch * self.count + 1)
         return counts.index_add(0, self.query, torch.ones_like(self.query))[:-1].reshape(self.batch, self.count)
 
     def padded(self) -> tuple[Tensor, Tensor]:
-        """Return the roots as [B, N, I, 3] and a mask [B, N, I], I the most roots of any query, at least 1."""
+        """Return the roots as [B, N, I, 3] and a mask [B, N, I]; I is the largest number of roots of a query, at least 1."""
         total = self.batch * self.count
         real = (self.query < total).nonzero()[:, 0]
         query = self.query[real]
@@ -70,7 +71,7 @@ class Correspondences:
         return roots.reshape(self.batch, self.count, most, 3), mask.reshape(self.batch, self.count, most)
 
     def maximum(self, values: Tensor, empty: float) -> Tensor:
-        """Return the largest of `values` [M] over each query's correspondences, [B, N]; `empty` where there is none.
+        """Return the maximum of `values` [M] over the correspondences of each query, [B, N]; `empty` if there are none.
 
         Source: SNARF Eq. 9.
         """
@@ -84,43 +85,29 @@ def find_correspondences(
     skinning_weights: Tensor,
     grid: CanonicalGrid,
     *,
-    search: str = "complete",
-    init_bones: Sequence[int] | None = None,
+    search: SearchConfig | str | None = None,
     active_cells: Tensor | None = None,
-    tolerance: float = 5e-6,
-    max_steps: int = 10,
-    divergence: float = 0.25,
-    jacobian: str = "exact",
-    orientation_preserving: bool = False,
-    backend: str = "auto",
     capacity: int | None = None,
     check: bool = True,
 ) -> Correspondences:
     """Find the canonical points that forward skinning moves onto the given posed points.
 
     Args:
-        points: queries [B, N, 3], posed space, metres. A non-finite point has no correspondence.
+        points: [B, N, 3], queries, posed space, metres. A non-finite point has no correspondence.
         bone_transforms: [B, J, 4, 4], canonical to posed, metres; invertible.
-        skinning_weights: [D, H, W, J] at the grid nodes (z, y, x), rows sum to 1.
+        skinning_weights: [D, H, W, J], at the grid nodes (z, y, x), rows sum to 1.
         grid: the box of the nodes.
-        search: "complete" (cell by cell, without start bones) or "broyden" (the papers': one start per bone).
-        init_bones: bones that start a broyden search; None for all.
-        active_cells: bool [D-1, H-1, W-1], the cells that a complete search looks into; None for all.
-        tolerance: largest residual of a root, as a share of the grid's longest side.
-        max_steps: most steps for one start.
-        divergence: residual at which a broyden start is given up, as a share of the grid's longest side.
-        jacobian: "exact", or "broyden" for the approximate inverse of a broyden search (Fast-SNARF Eq. 15).
-        orientation_preserving: leave out roots where the Jacobian's determinant is negative: there the body is inside out.
-        backend: "native" (the compiled CPU library, CUDA kernels on a GPU), "reference" (PyTorch), or "auto" for native where
-            it is there; a warning says once why it is not.
-        capacity: most roots to return. The results then have this length whatever is found, so that a GPU need not be waited
-            for and the call can be captured in a CUDA graph; rows beyond the roots have the query B * N. torch.compile with
+        search: settings of the search, or its name: "complete" (cell by cell, without start bones) or "broyden" (the papers',
+            from one start per bone). None for the defaults of `SearchConfig`.
+        active_cells: [D-1, H-1, W-1], bool, the cells in which a complete search looks for roots; None for all.
+        capacity: maximum number of roots to return. The results have this length whatever is found, and rows beyond the roots
+            have the query B * N; so nothing waits for a GPU, and the call can be captured in a CUDA graph. torch.compile with
             fullgraph=True needs it too, or torch._dynamo.config.capture_dynamic_output_shape_ops.
-        check: whether to look at the values of transforms and weights; on a GPU they are never looked at.
+        check: whether to check the values of transforms and weights; skipped on a GPU, where it would force a synchronisation.
 
     Returns:
         The correspondences, differentiable in `points`, `bone_transforms` and `skinning_weights` by implicit
-        differentiation at the roots; no gradient passes the iterations. A second derivative is refused.
+        differentiation at the roots; the iterations are not differentiated. There is no second derivative.
 
     Raises:
         ValueError: a shape, name or index does not fit, a transform is not finite or singular, or weights do not sum to 1; the
@@ -129,32 +116,34 @@ def find_correspondences(
 
     Source: SNARF Sec. 3.2 and 3.4 (Eq. 5-9, 14); Fast-SNARF Sec. 4.
     """
+    search = as_search_config(search)
     _check_shapes(points, bone_transforms, skinning_weights, active_cells)
-    _check_settings(search, init_bones, active_cells, jacobian, backend, bone_transforms.shape[1])
-    for name, value in (("tolerance", tolerance), ("max_steps", max_steps), ("divergence", divergence)):
-        if not value > 0:
-            raise ValueError(f"{name} must be greater than 0, got {value}")
+    check_search_config(search, bone_transforms.shape[1])
+    if search.name == "broyden" and active_cells is not None:
+        raise ValueError("active_cells needs search.name 'complete': a broyden search has no cells")
     if capacity is not None and capacity < 0:
-        raise ValueError(f"capacity must be 0 or more, got {capacity}")
+        raise ValueError(f"capacity: wanted 0 or more, got {capacity}")
     grid = grid.to(points)
     if check:
         _check_values(grid, bone_transforms, skinning_weights, active_cells)
     depth, height, width = skinning_weights.shape[:3]
-    transforms = blend_transforms(skinning_weights, bone_transforms, active_cells, backend)
+    transforms = blend_transforms(skinning_weights, bone_transforms, active_cells, search.backend)
     box = (grid.lower, grid.upper, [depth, height, width])
-    common = (orientation_preserving, capacity, backend)
-    if search == "complete":
-        found = complete_search(points, transforms, *box, active_cells, tolerance, max_steps, *common)
+    common = (search.orientation_preserving, capacity, search.backend)
+    if search.name == "complete":
+        found = complete_search(points, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
     else:
-        starts = _start_transforms(bone_transforms.detach(), init_bones)
-        found = broyden_search(points, transforms, starts, *box, tolerance, divergence, max_steps, jacobian == "exact", *common)
+        starts = _start_transforms(bone_transforms.detach(), search.init_bones)
+        limits = (search.tolerance, search.divergence, search.max_steps)
+        found = broyden_search(points, transforms, starts, *box, *limits, search.jacobian == "exact", *common)
     canonical, query, jacobian_inverse, total = found
     return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
 
 
 def _start_transforms(bone_transforms: Tensor, init_bones: Sequence[int] | None) -> Tensor:
     """Return the upper rows of the inverse transforms of the start bones, [B, I, 12], posed to canonical."""
-    chosen = bone_transforms if init_bones is None else bone_transforms[:, list(init_bones)]
+    # Stacked, since a list as an index would be copied to a GPU, which waits for it.
+    chosen = bone_transforms if init_bones is None else torch.stack([bone_transforms[:, bone] for bone in init_bones], 1)
     turn, _ = invert_3x3(chosen[..., :3, :3].reshape(-1, 3, 3))
     shift = -(turn * chosen[..., :3, 3].reshape(-1, 1, 3)).sum(-1)
     return torch.cat([turn, shift[..., None]], -1).reshape(*chosen.shape[:2], 12)
@@ -162,30 +151,34 @@ def _start_transforms(bone_transforms: Tensor, init_bones: Sequence[int] | None)
 
 @torch.no_grad()
 def check_transforms(bone_transforms: Tensor) -> None:
-    """Refuse transforms [B, J, 4, 4] that cannot be inverted; on a GPU, which would be waited for, nothing is looked at.
+    """Raise ValueError for transforms [B, J, 4, 4] that are not finite or singular.
 
-    Raises:
-        ValueError: one is not finite or singular.
+    Skipped on a GPU, where the check would force a synchronisation.
     """
-    if bone_transforms.is_cuda or torch.compiler.is_compiling():
+    if _skips_checks(bone_transforms):
         return
     if not bool(bone_transforms.isfinite().all()):
-        raise ValueError("bone_transforms must be finite, got NaN or infinite values")
+        raise ValueError("bone_transforms: wanted finite numbers, got NaN or infinite ones")
     turn = bone_transforms[..., :3, :3].reshape(-1, 3, 3)
     _, determinant = invert_3x3(turn)
     singular = (determinant.abs() <= 1e-9 * turn.abs().amax((1, 2)) ** 3).nonzero()[:, 0]
     if len(singular):
         pose, bone = divmod(int(singular[0]), bone_transforms.shape[1])
-        raise ValueError(f"bone_transforms must be invertible, got a singular one for bone {bone} of pose {pose}")
+        raise ValueError(f"bone_transforms: wanted invertible ones, got a singular one for bone {bone} of pose {pose}")
+
+
+def _skips_checks(tensor: Tensor) -> bool:
+    """Return whether reading the values of a tensor would wait for a GPU, or break a graph that is compiled."""
+    return tensor.is_cuda or torch.compiler.is_compiling()
 
 
 def _check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
-    """Refuse a box, transforms or weights that are none; on a GPU, which would be waited for, nothing is looked at."""
-    if bone_transforms.is_cuda or torch.compiler.is_compiling():
+    """Raise ValueError if grid, transforms or weights are invalid. Skipped on a GPU, as in `check_transforms`."""
+    if _skips_checks(bone_transforms):
         return
     if not bool((grid.upper > grid.lower).all()):
         box = f"{grid.lower.tolist()} and {grid.upper.tolist()}"
-        raise ValueError(f"grid.upper must exceed grid.lower in {grid.lower.dtype}, got {box}")
+        raise ValueError(f"grid.upper: wanted more than grid.lower in {grid.lower.dtype}, got {box}")
     check_transforms(bone_transforms)
     with torch.no_grad():
         wrong = ~((skinning_weights.sum(-1) - 1).abs() < 1e-3)
@@ -193,53 +186,31 @@ def _check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights
             wrong &= corners_of(active_cells)
         if bool(wrong.any()):
             came = float(skinning_weights[wrong][0].sum())
-            raise ValueError(f"skinning_weights must sum to 1 at every node of a searched cell, got a sum of {came:.4g}")
+            raise ValueError(f"skinning_weights: wanted a sum of 1 at every node of a searched cell, got {came:.4g}")
 
 
 def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
-    """Refuse tensors that do not fit together."""
+    """Raise ValueError or TypeError if the tensors do not fit together."""
     if points.ndim != 3 or points.shape[2] != 3:
-        raise ValueError(f"points must have shape [B, N, 3], got {list(points.shape)}")
+        raise ValueError(f"points: wanted shape [B, N, 3], got {list(points.shape)}")
     if skinning_weights.ndim != 4 or min(skinning_weights.shape[:3]) < 2 or skinning_weights.shape[3] < 1:
-        raise ValueError(f"skinning_weights must be [D, H, W, J], two nodes or more a side, got {list(skinning_weights.shape)}")
+        raise ValueError(
+            f"skinning_weights: wanted shape [D, H, W, J], at least 2 nodes per side, got {list(skinning_weights.shape)}"
+        )
     wanted = [points.shape[0], skinning_weights.shape[3], 4, 4]
     if list(bone_transforms.shape) != wanted:
-        raise ValueError(f"bone_transforms must have shape {wanted} to fit the others, got {list(bone_transforms.shape)}")
+        raise ValueError(f"bone_transforms: wanted shape {wanted} to fit the others, got {list(bone_transforms.shape)}")
     for name, tensor in (("points", points), ("bone_transforms", bone_transforms), ("skinning_weights", skinning_weights)):
         if tensor.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"{name} must be float32 or float64, got {tensor.dtype}")
+            raise TypeError(f"{name}: wanted float32 or float64, got {tensor.dtype}")
         if tensor.dtype != points.dtype:
-            raise TypeError(f"{name} must have the dtype of points, {points.dtype}, got {tensor.dtype}")
+            raise TypeError(f"{name}: wanted the dtype of points, {points.dtype}, got {tensor.dtype}")
         if tensor.device != points.device:
-            raise ValueError(f"{name} must be on the device of points, {points.device}, got {tensor.device}")
+            raise ValueError(f"{name}: wanted the device of points, {points.device}, got {tensor.device}")
     if active_cells is None:
         return
     cells = [n - 1 for n in skinning_weights.shape[:3]]
     if list(active_cells.shape) != cells or active_cells.dtype != torch.bool:
-        raise ValueError(f"active_cells must be bool {cells}, got {active_cells.dtype} {list(active_cells.shape)}")
+        raise ValueError(f"active_cells: wanted bool {cells}, got {active_cells.dtype} {list(active_cells.shape)}")
     if active_cells.device != points.device:
-        raise ValueError(f"active_cells must be on the device of points, {points.device}, got {active_cells.device}")
-
-
-def _check_settings(
-    search: str, init_bones: Sequence[int] | None, active_cells: Tensor | None, jacobian: str, backend: str, bones: int
-) -> None:
-    """Refuse names and settings that mean nothing, or nothing to this search."""
-    choices = {
-        "search": (search, ("complete", "broyden")),
-        "jacobian": (jacobian, ("exact", "broyden")),
-        "backend": (backend, ("auto", "native", "reference")),
-    }
-    for name, (value, known) in choices.items():
-        if value not in known:
-            raise ValueError(f"{name} must be {', '.join(map(repr, known[:-1]))} or {known[-1]!r}, got {value!r}")
-    if search == "complete" and jacobian == "broyden":
-        raise ValueError("jacobian='broyden' needs search='broyden': a complete search has the exact one at hand")
-    if search == "complete" and init_bones is not None:
-        raise ValueError("init_bones needs search='broyden': a complete search has no starts")
-    if search == "broyden" and active_cells is not None:
-        raise ValueError("active_cells needs search='complete': broyden goes wherever its steps lead")
-    if init_bones is not None and not all(0 <= bone < bones for bone in init_bones):
-        raise ValueError(f"init_bones must lie in 0..{bones - 1}, got {list(init_bones)}")
-    if init_bones is not None and not len(init_bones):
-        raise ValueError("init_bones must name at least one bone, got none; None means all bones")
+        raise ValueError(f"active_cells: wanted the device of points, {points.device}, got {active_cells.device}")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch.utils.checkpoint import checkpoint
 
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.grid import CanonicalGrid
+from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
 from snarfcli.precision import matmul_precision
 
 __all__ = ["find_correspondences_on_field"]
@@ -24,43 +26,35 @@ def find_correspondences_on_field(
     points: Tensor,
     bone_transforms: Tensor,
     field: Field,
+    grid: CanonicalGrid,
     *,
-    grid: CanonicalGrid | None = None,
-    init_bones: Sequence[int] | None = None,
-    tolerance: float = 1e-5,
-    max_steps: int = 50,
-    divergence: float = 1.0,
-    jacobian: str = "exact",
+    search: SearchConfig | str = "broyden",
+    bounded: bool = True,
     start_jacobian: str = "exact",
-    orientation_preserving: bool = False,
     points_at_once: int = 32_768,
 ) -> Correspondences:
     """Find the canonical points that forward skinning with a continuous weight field moves onto the given posed points.
 
-    From each start B_i^-1 x' Broyden's method runs on the field itself; which roots exist beyond those that it reaches is not
-    known (the grid's complete search knows). The field may be any function of PyTorch: it is called with canonical points
+    From each start B_i^-1 x' Broyden's method runs on the field itself; whether there are roots beyond those that it reaches is
+    not known (the grid's complete search knows). The field may be any function of PyTorch: it is called with canonical points
     [K, 3] in chunks, must treat each row on its own, give the same answer for the same point, and be differentiable by the
     points. It always runs in full precision here.
 
     Args:
-        points: queries [B, N, 3], posed space, metres. A non-finite point has no correspondence.
+        points: [B, N, 3], queries, posed space, metres. A non-finite point has no correspondence.
         bone_transforms: [B, J, 4, 4], canonical to posed, metres; finite and invertible.
         field: canonical points [K, 3], metres, to weights [K, J], rows sum to 1.
-        grid: a canonical box that iterates are clamped to and roots lie in; None for no bounds.
-        init_bones: bones that start a search; None for all.
-        tolerance: largest residual of a root, metres (SNARF Sec. 3.2: 1e-5).
-        max_steps: most steps from one start.
-        divergence: residual at which a start is given up, metres.
-        jacobian: inverse Jacobian at the roots, for the gradient: "exact", or "broyden" for the approximation that the
-            iteration leaves (Fast-SNARF Eq. 15).
+        grid: canonical box. Its longest side is the unit of `search.tolerance` and `search.divergence`.
+        search: settings of the search; its name must be "broyden", and its backend is not used. The papers' values are a
+            tolerance of 1e-5 m, 50 steps and a divergence of 1 m.
+        bounded: whether iterates are clamped to the box, so that all roots lie in it.
         start_jacobian: "exact" (SNARF Eq. 7), or "blended" for the blended 3x3 alone, without the weights' derivative.
-        orientation_preserving: keep only roots where the determinant of the exact Jacobian is positive.
-        points_at_once: most iterates, and roots, for which the field is evaluated at a time; bounds the memory.
+        points_at_once: maximum number of iterates, and of roots, per evaluation of the field; bounds the memory.
 
     Returns:
         The correspondences without duplicates, those of a query in the order of the starts. They are differentiable in
-        `points`, `bone_transforms` and whatever `field` depends on, by implicit differentiation at the roots; no gradient
-        passes the iterations. A second derivative is refused.
+        `points`, `bone_transforms` and everything that `field` depends on, by implicit differentiation at the roots; the
+        iterations are not differentiated. There is no second derivative.
 
     Raises:
         ValueError: a shape, name, index or transform does not fit, or `field` returns another shape; the message names the
@@ -69,12 +63,22 @@ def find_correspondences_on_field(
 
     Source: SNARF Eq. 5-8 and 14.
     """
-    bones = _check(points, bone_transforms, init_bones, jacobian, start_jacobian)
-    for name, value in (("tolerance", tolerance), ("divergence", divergence), ("points_at_once", points_at_once)):
-        if not value > 0:
-            raise ValueError(f"{name} must be positive, got {value}")
-    grid = None if grid is None else grid.to(points)
-    # The derivative by the point needs autograd even where the caller has switched it off; inference tensors know none.
+    search = as_search_config(search)
+    bones = _check(points, bone_transforms, search, start_jacobian)
+    if points_at_once < 1:
+        raise ValueError(f"points_at_once: wanted at least 1, got {points_at_once}")
+    grid = grid.to(points)
+    length = grid.longest_side
+    settings = _Settings(
+        box=grid if bounded else None,
+        tolerance=search.tolerance * length,
+        divergence=search.divergence * length,
+        max_steps=search.max_steps,
+        exact_start=start_jacobian == "exact",
+        exact_at_roots=search.jacobian == "exact",
+        orientation_preserving=search.orientation_preserving,
+    )
+    # The derivative by the point needs autograd even where the caller has switched it off; inference tensors have none.
     with (
         torch.inference_mode(False),
         torch.no_grad(),
@@ -84,32 +88,49 @@ def find_correspondences_on_field(
         still, moves = points.detach().clone(), bone_transforms.detach().clone()
         inverses, failed = torch.linalg.inv_ex(moves)
         if bool(failed.any()) or not bool(inverses.isfinite().all()):
-            raise ValueError("bone_transforms must be finite and invertible, got one that is not")
+            raise ValueError("bone_transforms: wanted finite and invertible ones, got one that is not")
+        parts = [(still.new_empty(0, 3), torch.empty(0, dtype=torch.long, device=still.device), still.new_empty(0, 3, 3))]
         each = max(1, points_at_once // len(bones))
-        parts = []
         for b in range(points.shape[0]):
             at_pose = _Skinning(field, moves[b])
             for start in range(0, points.shape[1], each):
-                queries = still[b, start : start + each]
-                known = queries.isfinite().all(1).nonzero()[:, 0]
-                canonical_from_posed = inverses[b, bones, :3]
-                starts = torch.einsum("jrc,nc->njr", canonical_from_posed[..., :3], queries[known])
-                starts = (starts + canonical_from_posed[..., 3]).reshape(-1, 3)
-                query = known[:, None].expand(-1, len(bones)).reshape(-1)
-                found = _iterate(
-                    at_pose, queries, query, starts, grid, tolerance, max_steps, divergence, start_jacobian == "exact"
-                )
-                found = _unique(*found, _SAME_ROOT * tolerance)
-                found = _finish(at_pose, queries, *found, tolerance, jacobian == "exact", orientation_preserving, grid)
-                x, query, inverse = _unique(*found, _SAME_ROOT * tolerance)
+                x, query, inverse = _search(at_pose, still[b, start : start + each], inverses[b, bones, :3], settings)
                 parts.append((x, query + (b * points.shape[1] + start), inverse))
-        if not parts:
-            parts = [(still.new_empty(0, 3), torch.empty(0, dtype=torch.long, device=still.device), still.new_empty(0, 3, 3))]
         canonical, query, inverse = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
     with torch.autocast(points.device.type, enabled=False), matmul_precision("highest"):
         canonical = _attach_gradient(points, bone_transforms, field, canonical, query, inverse, points_at_once)
     total = torch.tensor([len(query)], device=query.device)
     return Correspondences(canonical, query, inverse, points.shape[0], points.shape[1], total)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of one search, lengths in metres."""
+
+    box: CanonicalGrid | None
+    tolerance: float
+    divergence: float
+    max_steps: int
+    exact_start: bool
+    exact_at_roots: bool
+    orientation_preserving: bool
+
+    def bounded(self, x: Tensor) -> Tensor:
+        """Return points [K, 3] clamped to the box, if there is one."""
+        return x if self.box is None else x.clamp(self.box.lower, self.box.upper)
+
+
+def _search(
+    at_pose: _Skinning, queries: Tensor, canonical_from_posed: Tensor, settings: _Settings
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the roots of queries [N, 3] of one pose from start bones [I, 3, 4]; return roots, their queries and J^-1."""
+    known = queries.isfinite().all(1).nonzero()[:, 0]
+    starts = torch.einsum("jrc,nc->njr", canonical_from_posed[..., :3], queries[known])
+    starts = (starts + canonical_from_posed[..., 3]).reshape(-1, 3)
+    query = known[:, None].expand(-1, len(canonical_from_posed)).reshape(-1)
+    distance = _SAME_ROOT * settings.tolerance
+    found = _unique(*_iterate(at_pose, queries, query, starts, settings), distance)
+    return _unique(*_finish(at_pose, queries, *found, settings), distance)
 
 
 class _Skinning:
@@ -123,7 +144,7 @@ class _Skinning:
         """Return the blended transforms [K, 3, 4] at canonical points [K, 3]."""
         weights = self.field(x)
         if tuple(weights.shape) != (len(x), len(self.rows)):
-            raise ValueError(f"field must return weights of shape [{len(x)}, {len(self.rows)}], got {list(weights.shape)}")
+            raise ValueError(f"field: wanted weights of shape [{len(x)}, {len(self.rows)}], got {list(weights.shape)}")
         return (weights.to(self.rows.dtype) @ self.rows).reshape(-1, 3, 4)
 
     def __call__(self, x: Tensor) -> Tensor:
@@ -150,33 +171,25 @@ def _iterate(
     points: Tensor,
     query: Tensor,
     x: Tensor,
-    grid: CanonicalGrid | None,
-    tolerance: float,
-    max_steps: int,
-    divergence: float,
-    exact_start: bool,
+    settings: _Settings,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Run Broyden's method for each pair of query [S] and start [S, 3]; return roots, their queries and J^-1, by start."""
-
-    def bounded(x: Tensor) -> Tensor:
-        return x if grid is None else x.clamp(grid.lower, grid.upper)
-
-    x = bounded(x)
-    posed, matrix = at_pose.with_jacobian(x) if exact_start else at_pose.with_blended(x)
+    x = settings.bounded(x)
+    posed, matrix = at_pose.with_jacobian(x) if settings.exact_start else at_pose.with_blended(x)
     inverse = torch.linalg.inv_ex(matrix)[0].nan_to_num(0, 0, 0)
     residual = posed - points[query]
     start = torch.arange(len(query), device=query.device)
     found = []
-    for step_number in range(max_steps + 1):
+    for step_number in range(settings.max_steps + 1):
         distance = residual.norm(dim=1)
-        converged = distance < tolerance
+        converged = distance < settings.tolerance
         done = converged.nonzero()[:, 0]
         found.append((x[done], query[done], inverse[done], start[done]))
-        going = (~converged & (distance < divergence)).nonzero()[:, 0]
-        if step_number == max_steps or not len(going):
+        going = (~converged & (distance < settings.divergence)).nonzero()[:, 0]
+        if step_number == settings.max_steps or not len(going):
             break
         query, x, residual, inverse, start = query[going], x[going], residual[going], inverse[going], start[going]
-        moved = bounded(x - torch.bmm(inverse, residual[:, :, None])[:, :, 0])
+        moved = settings.bounded(x - torch.bmm(inverse, residual[:, :, None])[:, :, 0])
         step, x = moved - x, moved
         change = at_pose(x) - points[query] - residual
         residual = residual + change
@@ -196,26 +209,23 @@ def _finish(
     x: Tensor,
     query: Tensor,
     inverse: Tensor,
-    tolerance: float,
-    exact: bool,
-    orientation_preserving: bool,
-    grid: CanonicalGrid | None,
+    settings: _Settings,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Put the exact inverse Jacobian at the roots, let it polish them by one short Newton step, and drop what is no root.
+    """Replace the approximate inverse Jacobians by exact ones, and polish the roots with one short Newton step.
 
     A root on a fold, where the Jacobian has no inverse, has no gradient either and is dropped.
     """
-    if not (exact or orientation_preserving) or not len(x):
+    if not (settings.exact_at_roots or settings.orientation_preserving) or not len(x):
         return x, query, inverse
     posed, matrix = at_pose.with_jacobian(x)
     at_root = torch.linalg.inv_ex(matrix)[0]
     keep = at_root.isfinite().all(2).all(1)
-    if orientation_preserving:
+    if settings.orientation_preserving:
         keep &= torch.linalg.det(matrix) > 0
-    if exact:
+    if settings.exact_at_roots:
         step = torch.bmm(at_root, (posed - points[query])[:, :, None])[:, :, 0]
-        x = torch.where(step.norm(dim=1, keepdim=True) < _POLISH * tolerance, x - step, x)
-        x = x if grid is None else x.clamp(grid.lower, grid.upper)
+        x = torch.where(step.norm(dim=1, keepdim=True) < _POLISH * settings.tolerance, x - step, x)
+        x = settings.bounded(x)
         inverse = at_root
     return x[keep], query[keep], inverse[keep]
 
@@ -244,7 +254,7 @@ def _attach_gradient(
     for b, many in enumerate(per_pose):
         at_pose = _Skinning(field, bone_transforms[b])
         for x in canonical[first : first + many].split(at_once):
-            # More roots than fit at a time: the field's intermediate results are computed again in the backward pass.
+            # More roots than fit at once: the field's intermediate results are computed again in the backward pass.
             whole = len(canonical) <= at_once
             parts.append(at_pose(x) if whole else checkpoint(at_pose, x, use_reentrant=False))
         first += many
@@ -272,31 +282,23 @@ class _ImplicitRoots(torch.autograd.Function):
         return -pulled, pulled, None, None
 
 
-def _check(
-    points: Tensor, bone_transforms: Tensor, init_bones: Sequence[int] | None, jacobian: str, start_jacobian: str
-) -> list[int]:
-    """Refuse arguments that do not fit together; return the bones to start from."""
+def _check(points: Tensor, bone_transforms: Tensor, search: SearchConfig, start_jacobian: str) -> list[int]:
+    """Raise ValueError or TypeError if arguments do not fit together; return the bones to start from."""
     if points.ndim != 3 or points.shape[2] != 3:
-        raise ValueError(f"points must have shape [B, N, 3], got {list(points.shape)}")
+        raise ValueError(f"points: wanted shape [B, N, 3], got {list(points.shape)}")
     shape = list(bone_transforms.shape)
     if len(shape) != 4 or shape[0] != points.shape[0] or shape[1] < 1 or shape[2:] != [4, 4]:
-        raise ValueError(f"bone_transforms must have shape [{points.shape[0]}, J, 4, 4] to fit points, got {shape}")
+        raise ValueError(f"bone_transforms: wanted shape [{points.shape[0]}, J, 4, 4] to fit points, got {shape}")
     for name, tensor in (("points", points), ("bone_transforms", bone_transforms)):
         if tensor.dtype not in (torch.float32, torch.float64):
-            raise TypeError(f"{name} must be float32 or float64, got {tensor.dtype}")
+            raise TypeError(f"{name}: wanted float32 or float64, got {tensor.dtype}")
     if bone_transforms.dtype != points.dtype:
-        raise TypeError(f"bone_transforms must have the dtype of points, {points.dtype}, got {bone_transforms.dtype}")
+        raise TypeError(f"bone_transforms: wanted the dtype of points, {points.dtype}, got {bone_transforms.dtype}")
     if bone_transforms.device != points.device:
-        raise ValueError(f"bone_transforms must be on the device of points, {points.device}, got {bone_transforms.device}")
-    for name, value, choices in (
-        ("jacobian", jacobian, ("exact", "broyden")),
-        ("start_jacobian", start_jacobian, ("exact", "blended")),
-    ):
-        if value not in choices:
-            raise ValueError(f"{name} must be {choices[0]!r} or {choices[1]!r}, got {value!r}")
-    bones = list(range(shape[1])) if init_bones is None else list(init_bones)
-    if not bones:
-        raise ValueError("init_bones must name at least one bone, got none; None means all bones")
-    if not all(0 <= bone < shape[1] for bone in bones):
-        raise ValueError(f"init_bones must lie in 0..{shape[1] - 1}, got {bones}")
-    return bones
+        raise ValueError(f"bone_transforms: wanted the device of points, {points.device}, got {bone_transforms.device}")
+    check_search_config(search, shape[1])
+    if search.name != "broyden":
+        raise ValueError(f"search.name: wanted broyden, got {search.name!r}: a field has no cells to search")
+    if start_jacobian not in ("exact", "blended"):
+        raise ValueError(f"start_jacobian: wanted exact or blended, got {start_jacobian!r}")
+    return list(range(shape[1])) if search.init_bones is None else list(search.init_bones)

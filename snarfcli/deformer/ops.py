@@ -1,30 +1,40 @@
-"""The searches and their gradient as PyTorch operators: seen by autograd, torch.compile and every device alike.
+"""The searches and their gradient as torch.library operators with autograd, fake kernels and per-device implementations.
 
-An operator checks nothing; `find_correspondences` does. Each has a kernel for CPU tensors (the native library, or the readable
-version in PyTorch) and one for CUDA tensors, a fake kernel that only knows shapes, and the implicit gradient of SNARF Eq. 14.
+An operator does not check its arguments; `find_correspondences` does. The default kernel of each is the readable reference in
+PyTorch, for every type of device. CPU and CUDA tensors have native kernels as well, chosen by the argument `backend`. The
+gradient is the implicit one of SNARF Eq. 14.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from snarfcli.deformer.blending import refuse_second_derivative
+from snarfcli.deformer.blending import raise_for_second_derivative
 from snarfcli.deformer.broyden import broyden_roots
 from snarfcli.deformer.complete import complete_roots
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
 from snarfcli.deformer.roots import Roots
 from snarfcli.native import cpu, cuda
-from snarfcli.native.cuda_compile import nvrtc_version
-from snarfcli.native.library import choose_backend
+from snarfcli.native.backend import choose_backend
+from snarfcli.native.capacity import fit_to_capacity
 
-__all__ = ["broyden_search", "complete_search", "implicit_backward", "implicit_backward_reference"]
+__all__ = [
+    "broyden_search",
+    "broyden_search_reference",
+    "complete_search",
+    "complete_search_reference",
+    "implicit_backward",
+    "implicit_backward_reference",
+]
+
+Results = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
+# ---------------------------------------------------------------- complete search
 @torch.library.custom_op("snarf::complete_search", mutates_args=())
 def complete_search(
     points: Tensor,
@@ -42,40 +52,48 @@ def complete_search(
     """Find the roots of T(x) [x; 1] = x' in every active cell of the grid.
 
     Args:
-        points: queries [B, N, 3], posed space, metres.
-        transforms: blended transforms [B, D * H * W, 12] at the nodes.
-        lower, upper: corners of the grid's box, [3], canonical space, metres.
+        points: [B, N, 3], queries, posed space, metres.
+        transforms: [B, D * H * W, 12], blended transforms at the nodes.
+        lower, upper: [3], corners of the grid's box, canonical space, metres.
         shape: nodes (D, H, W).
-        active_cells: bool [D-1, H-1, W-1]; None for all.
+        active_cells: [D-1, H-1, W-1], bool; None for all.
         tolerance: largest residual of a root, as a share of the box's longest side.
-        max_steps: most Newton steps from one start.
+        max_steps: maximum number of Newton steps from one start.
         orientation_preserving: keep only roots where the Jacobian's determinant is positive.
-        capacity: length of the results, padded with query B * N; None for as many as there are roots.
+        capacity: length of the results, padded with query B * N; None for the number of roots.
         backend: "auto", "native" or "reference".
 
     Returns:
         canonical [M, 3], query [M], jacobian_inverse [M, 3, 3], and the number of roots found, [1].
     """
+    _check_default_kernel(points, backend)
+    return complete_search_reference(
+        points, transforms, lower, upper, shape, active_cells, tolerance, max_steps, orientation_preserving, capacity
+    )
+
+
+def complete_search_reference(
+    points: Tensor,
+    transforms: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    shape: Sequence[int],
+    active_cells: Tensor | None,
+    tolerance: float,
+    max_steps: int,
+    orientation_preserving: bool,
+    capacity: int | None,
+) -> Results:
+    """The readable version of `complete_search`."""
     grid, nodes = _grid(lower, upper, shape)
-    if points.is_cuda and _choose_cuda(backend) == "native":
-        box = (lower, upper, shape)
-        return cuda.complete_search(
-            points, transforms, *box, active_cells, tolerance, max_steps, orientation_preserving, capacity
-        )
     metres = tolerance * grid.longest_side
-    if not points.is_cuda and choose_backend(backend) == "native":
-        size = grid.cell_size(nodes)
-        found = cpu.complete_search(
-            points, transforms, lower, size, nodes, active_cells, metres, max_steps, orientation_preserving
-        )
-    else:
-        settings = {"active_cells": active_cells, "tolerance": metres, "max_steps": max_steps}
-        with torch.autocast(points.device.type, enabled=False):
-            roots = complete_roots(points, transforms, grid, nodes, **settings)
-        found = _reference_result(roots, orientation_preserving)
-    return _padded(*found, points, capacity)
+    settings = {"active_cells": active_cells, "tolerance": metres, "max_steps": max_steps}
+    with torch.autocast(points.device.type, enabled=False):
+        roots = complete_roots(points, transforms, grid, nodes, **settings)
+    return fit_to_capacity(*_reference_result(roots, orientation_preserving), points, capacity)
 
 
+# ---------------------------------------------------------------- broyden search
 @torch.library.custom_op("snarf::broyden_search", mutates_args=())
 def broyden_search(
     points: Tensor,
@@ -95,27 +113,47 @@ def broyden_search(
     """Run Broyden's method from the images of each query under `starts`; otherwise as `complete_search`.
 
     Args:
-        starts: upper three rows of the inverse transforms of the start bones, [B, I, 12], posed to canonical.
+        starts: [B, I, 12], upper three rows of the inverse transforms of the start bones, posed to canonical.
         divergence: residual at which a start is given up, as a share of the box's longest side.
         exact_jacobian: whether the inverse Jacobian is the exact one at the root or the iteration's approximation.
     """
+    _check_default_kernel(points, backend)
+    settings = (tolerance, divergence, max_steps, exact_jacobian, orientation_preserving, capacity)
+    return broyden_search_reference(points, transforms, starts, lower, upper, shape, *settings)
+
+
+def broyden_search_reference(
+    points: Tensor,
+    transforms: Tensor,
+    starts: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    shape: Sequence[int],
+    tolerance: float,
+    divergence: float,
+    max_steps: int,
+    exact_jacobian: bool,
+    orientation_preserving: bool,
+    capacity: int | None,
+) -> Results:
+    """The readable version of `broyden_search`."""
     grid, nodes = _grid(lower, upper, shape)
-    rest = (max_steps, exact_jacobian, orientation_preserving)
-    if points.is_cuda and _choose_cuda(backend) == "native":
-        box = (lower, upper, shape)
-        return cuda.broyden_search(points, transforms, starts, *box, tolerance, divergence, *rest, capacity)
-    metres = (tolerance * grid.longest_side, divergence * grid.longest_side)
-    if not points.is_cuda and choose_backend(backend) == "native":
-        found = cpu.broyden_search(points, transforms, starts, lower, grid.cell_size(nodes), nodes, *metres, *rest)
-    else:
-        keys = ("exact_jacobian", "tolerance", "divergence", "max_steps")
-        settings = dict(zip(keys, (exact_jacobian, *metres, max_steps), strict=True))
-        with torch.autocast(points.device.type, enabled=False):
-            roots = broyden_roots(points, transforms, starts, grid, nodes, **settings)
-        found = _reference_result(roots, orientation_preserving)
-    return _padded(*found, points, capacity)
+    with torch.autocast(points.device.type, enabled=False):
+        roots = broyden_roots(
+            points,
+            transforms,
+            starts,
+            grid,
+            nodes,
+            exact_jacobian=exact_jacobian,
+            tolerance=tolerance * grid.longest_side,
+            divergence=divergence * grid.longest_side,
+            max_steps=max_steps,
+        )
+    return fit_to_capacity(*_reference_result(roots, orientation_preserving), points, capacity)
 
 
+# ---------------------------------------------------------------- gradient of both
 @torch.library.custom_op("snarf::implicit_backward", mutates_args=())
 def implicit_backward(
     gradient: Tensor,
@@ -134,19 +172,14 @@ def implicit_backward(
     """Return the gradients of a loss by the queries [B, N, 3] and by the transforms [B, D * H * W, 12]; empty if not wanted.
 
     Args:
-        gradient: of the loss by the roots, [M, 3].
+        gradient: [M, 3], of the loss by the roots.
         canonical, query, jacobian_inverse: as the search returned them.
 
     Source: SNARF Eq. 14.
     """
-    grid, nodes = _grid(lower, upper, shape)
-    wants = (wants_points, wants_transforms)
+    _check_default_kernel(gradient, backend)
     roots = (gradient, canonical, query, jacobian_inverse)
-    if gradient.is_cuda and _choose_cuda(backend) == "native":
-        return cuda.implicit_backward(*roots, lower, upper, shape, batch, count, *wants)
-    if not gradient.is_cuda and choose_backend(backend) == "native":
-        return cpu.implicit_backward(*roots, lower, grid.cell_size(nodes), nodes, batch, count, wants)
-    return implicit_backward_reference(*roots, grid, nodes, batch, count, wants)
+    return implicit_backward_reference(*roots, lower, upper, shape, batch, count, wants_points, wants_transforms)
 
 
 def implicit_backward_reference(
@@ -154,88 +187,69 @@ def implicit_backward_reference(
     canonical: Tensor,
     query: Tensor,
     jacobian_inverse: Tensor,
-    grid: CanonicalGrid,
-    shape: tuple[int, int, int],
+    lower: Tensor,
+    upper: Tensor,
+    shape: Sequence[int],
     batch: int,
     count: int,
-    wants: tuple[bool, bool],
+    wants_points: bool,
+    wants_transforms: bool,
 ) -> tuple[Tensor, Tensor]:
     """The readable version of `implicit_backward`.
 
     With g the gradient by x*, implicit differentiation gives v = J^-T g for the query, and -v outer [x*; 1], weighted
     trilinearly, for each of the eight nodes of the root's cell.
     """
+    grid, nodes = _grid(lower, upper, shape)
     known = (query < batch * count).nonzero()[:, 0]
     gradient, canonical, query = gradient[known], canonical[known], query[known]
     v = (jacobian_inverse[known] * gradient[:, :, None]).sum(1)
     v_points, v_transforms = gradient.new_empty(0), gradient.new_empty(0)
-    if wants[0]:
+    if wants_points:
         v_points = gradient.new_zeros(batch * count, 3).index_add(0, query, v).reshape(batch, count, 3)
-    if wants[1]:
-        nodes = shape[0] * shape[1] * shape[2]
-        cell, local = locate(canonical, grid, shape)
-        at = cell_corners(cell, shape) + (query // max(count, 1) * nodes)[:, None]
+    if wants_transforms:
+        per_pose = nodes[0] * nodes[1] * nodes[2]
+        cell, local = locate(canonical, grid, nodes)
+        at = cell_corners(cell, nodes) + (query // max(count, 1) * per_pose)[:, None]
         homogeneous = torch.cat([canonical, torch.ones_like(canonical[:, :1])], 1)
         v_blended = -(v[:, :, None] * homogeneous[:, None]).reshape(-1, 12)
         v_corners = trilinear_weights(local)[..., None] * v_blended[:, None]
-        v_transforms = gradient.new_zeros(batch * nodes, 12).index_add(0, at.reshape(-1), v_corners.reshape(-1, 12))
-        v_transforms = v_transforms.reshape(batch, nodes, 12)
+        v_transforms = gradient.new_zeros(batch * per_pose, 12).index_add(0, at.reshape(-1), v_corners.reshape(-1, 12))
+        v_transforms = v_transforms.reshape(batch, per_pose, 12)
     return v_points, v_transforms
+
+
+# ---------------------------------------------------------------- native kernels
+def _check_default_kernel(tensor: Tensor, backend: str) -> None:
+    """Raise if the native backend is asked for, and warn for "auto", where only the reference can run."""
+    choose_backend(backend, tensor.device.type)
+
+
+def _register_native(operator: torch.library.CustomOpDef, device_type: str, native: Callable, reference: Callable) -> None:
+    """Register `native` for one type of device, or `reference` where `backend`, the last argument, says so."""
+
+    @operator.register_kernel(device_type)
+    def kernel(*arguments):
+        *given, backend = arguments
+        return (native if choose_backend(backend, device_type) == "native" else reference)(*given)
+
+
+_register_native(complete_search, "cpu", cpu.complete_search, complete_search_reference)
+_register_native(complete_search, "cuda", cuda.complete_search, complete_search_reference)
+_register_native(broyden_search, "cpu", cpu.broyden_search, broyden_search_reference)
+_register_native(broyden_search, "cuda", cuda.broyden_search, broyden_search_reference)
+_register_native(implicit_backward, "cpu", cpu.implicit_backward, implicit_backward_reference)
+_register_native(implicit_backward, "cuda", cuda.implicit_backward, implicit_backward_reference)
 
 
 def _grid(lower: Tensor, upper: Tensor, shape: Sequence[int]) -> tuple[CanonicalGrid, tuple[int, int, int]]:
     return CanonicalGrid(lower, upper, checked=True), (shape[0], shape[1], shape[2])
 
 
-def _choose_cuda(backend: str) -> str:
-    """Return "native" or "reference" for tensors on a GPU, as `choose_backend` does for those on a CPU."""
-    if backend == "reference":
-        return backend
-    reason = _why_no_kernels()
-    if reason is None:
-        return "native"
-    if backend == "native":
-        raise RuntimeError(f"backend native is not available on this GPU: {reason}")
-    return "reference"
-
-
-@cache
-def _why_no_kernels() -> str | None:
-    """Return why the CUDA kernels cannot be compiled, after a warning, or None."""
-    try:
-        nvrtc_version()
-    except (RuntimeError, OSError) as error:
-        warnings.warn(
-            f"snarf searches with its reference in PyTorch, many times slower than its CUDA kernels: {error}",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        return str(error)
-    return None
-
-
 def _reference_result(roots: Roots, orientation_preserving: bool) -> tuple[Tensor, Tensor, Tensor]:
     if orientation_preserving:
         roots = roots.take((torch.linalg.det(roots.jacobian_inverse) > 0).nonzero()[:, 0])
     return roots.canonical, roots.query, roots.jacobian_inverse
-
-
-def _padded(
-    canonical: Tensor, query: Tensor, jacobian_inverse: Tensor, points: Tensor, capacity: int | None
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cut or fill the results to `capacity` rows."""
-    found = torch.tensor([len(query)], device=query.device)
-    if capacity is None:
-        return canonical, query, jacobian_inverse, found
-    kept = min(capacity, len(query))
-    out = (
-        points.new_zeros(capacity, 3),
-        query.new_full((capacity,), points.shape[0] * points.shape[1]),
-        points.new_zeros(capacity, 3, 3),
-    )
-    for filled, values in zip(out, (canonical, query, jacobian_inverse), strict=True):
-        filled[:kept] = values[:kept]
-    return *out, found
 
 
 # ---------------------------------------------------------------- shapes
@@ -263,7 +277,7 @@ def _(gradient, canonical, query, inverse, lower, upper, shape, batch, count, wa
 
 
 # ---------------------------------------------------------------- gradients
-def _remember(ctx, inputs, output, lower: int) -> None:
+def _save_for_backward(ctx, inputs, output, lower: int) -> None:
     """Keep what the gradient needs; `lower` is where the grid's box stands among the inputs."""
     points, backend = inputs[0], inputs[-1]
     canonical, query, jacobian_inverse, _ = output
@@ -283,6 +297,6 @@ def _backward(ctx, gradient, *_):
     return v_points if wants[0] else None, v_transforms if wants[1] else None, *rest
 
 
-complete_search.register_autograd(_backward, setup_context=lambda ctx, inputs, output: _remember(ctx, inputs, output, 2))
-broyden_search.register_autograd(_backward, setup_context=lambda ctx, inputs, output: _remember(ctx, inputs, output, 3))
-implicit_backward.register_autograd(refuse_second_derivative)
+for _operator, _lower in ((complete_search, 2), (broyden_search, 3)):
+    _operator.register_autograd(_backward, setup_context=partial(_save_for_backward, lower=_lower))
+implicit_backward.register_autograd(raise_for_second_derivative)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
+from snarfcli.deformer.skinning import interpolate
 from snarfcli.segments import segment_distances
 
-__all__ = ["BonePrior", "GridWeights", "NetworkWeights", "VoxelWeights", "WeightField", "total_variation"]
+__all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWeights", "WeightField", "total_variation"]
 
 
 class WeightField(nn.Module):
@@ -24,6 +26,20 @@ class WeightField(nn.Module):
 
     def set_box(self, grid: CanonicalGrid) -> None:
         """Take over the canonical box that the deformer has read from a file."""
+
+
+@dataclass(frozen=True)
+class NodeWeights:
+    """Skinning weights at the grid nodes, evaluated once and used by a search and by what follows it."""
+
+    values: Tensor
+    """[D, H, W, J]; where only nodes of active cells were evaluated, the others are zero."""
+    grid: CanonicalGrid
+    """The box of the nodes."""
+
+    def at(self, canonical: Tensor) -> Tensor:
+        """Return the skinning weights [N, J] at canonical points [N, 3], trilinear between the nodes."""
+        return interpolate(self.values, canonical, self.grid)
 
 
 class BonePrior(nn.Module):

@@ -13,7 +13,7 @@ from snarfcli.deformer import BonePrior, CanonicalGrid
 from snarfcli.deformer.hierarchy import make_softmax
 from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, PosedNetwork, into_root_frame, invert_blended, move_with_bones
-from snarfcli.models.system import pose_angles
+from snarfcli.models.system import Found, pose_angles
 from snarfcli.shape import CONDITIONS
 
 __all__ = ["BackLBS"]
@@ -57,7 +57,13 @@ class BackLBS(PointwiseSystem):
         return invert_blended(points, weights, bone_transforms), weights
 
     def bone_logits(
-        self, points: Tensor, owner: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+        self,
+        points: Tensor,
+        owner: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        precision: str = "highest",
+        found: Found | None = None,
     ) -> Tensor:
         # Canonical points have no weights here, but those of a bone move with it: that says which joints they see.
         index = torch.arange(len(points), device=points.device) % len(pose)

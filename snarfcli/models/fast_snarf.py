@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
-from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, SearchConfig, cells_near
+from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, NodeWeights, SearchConfig, cells_near
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
 
-__all__ = ["FastSnarf", "Snarf", "blend"]
+__all__ = ["FastSnarf", "FoundRoots", "blend"]
 
 _SAMPLES_M = 0.04  # most distance of the samples that judge a cell; a wrist is 5 cm thick
 _KEPT_RADIUS_M = 0.1  # cells with a corner this near to a bone are searched whatever the field says
@@ -31,13 +31,19 @@ _SURFACE_MOVES_M = 0.06  # how far the pose may move the canonical surface
 
 @dataclass(frozen=True)
 class FoundRoots(Found):
-    """All canonical points that forward skinning moves onto the posed points."""
+    """All canonical points that forward skinning moves onto the posed points, and the weights of that skinning."""
 
     roots: Correspondences
+    """The canonical points."""
+    weights: NodeWeights | None
+    """Skinning weights at the grid nodes; None for a field that was searched directly."""
 
 
 class FastSnarf(System):
     """Posed occupancy by correspondence search and a canonical occupancy network.
+
+    The system "snarf" is Fast-SNARF without its grid: the field of `skinning` is a network, and its own roots are found. Its
+    `skinning.name` is always "mlp", and its `search.name` must be "broyden".
 
     Args:
         config: architecture.
@@ -59,6 +65,8 @@ class FastSnarf(System):
         template: MeshTemplate | None = None,
         field: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
+        if config.model.name == "snarf":
+            config = replace(config, skinning=replace(config.skinning, name="mlp"))
         super().__init__(config, skeleton)
         if config.model.blend not in ("logit", "probability"):
             raise ValueError(f"model.blend must be logit or probability, got {config.model.blend!r}")
@@ -81,7 +89,8 @@ class FastSnarf(System):
         self._body_cells: Tensor | None = None
 
     def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
-        return FoundRoots(self.deformer(points, bone_transforms))
+        weights = self.deformer.node_weights()
+        return FoundRoots(self.deformer(points, bone_transforms, weights=weights), weights)
 
     def shape_at(self, found: FoundRoots, pose: Tensor, precision: str = "highest") -> FieldSamples:
         """Evaluate the shape network at the roots, and blend over those of a point in training, else take their maximum.
@@ -89,10 +98,16 @@ class FastSnarf(System):
         Source: SNARF Eq. 9.
         """
         roots = found.roots
-        logits = self.canonical_logits(roots.canonical, self.condition(pose), roots.pose, precision)
+        weights = self._weights_seen(roots.canonical, found.weights)
+        logits = self.canonical_logits(roots.canonical, self.condition(pose), roots.pose, precision, weights)
         combined = blend(logits, roots, self.config.model) if self.training else roots.maximum(logits, NO_CORRESPONDENCE)
         counts = roots.counts
         return FieldSamples(combined, counts > 0, counts)
+
+    @torch.no_grad()
+    def _weights_seen(self, canonical: Tensor, weights: NodeWeights | None) -> Tensor | None:
+        """Return the skinning weights [M, J] at canonical points [M, 3] if the shape depends on them, else None."""
+        return self.deformer.skinning_weights(canonical, weights) if self.depends_on_weights else None
 
     @torch.no_grad()
     def occupied_cells(self, pose: Tensor, threshold: float = 0.0, reach_m: float = 0.0, precision: str = "highest") -> Tensor:
@@ -107,7 +122,7 @@ class FastSnarf(System):
             precision: of the shape network.
         """
         deformer = self.deformer
-        deformer.remember_weights()
+        weights = deformer.node_weights(active_only=True)
         size = deformer.grid.cell_size(deformer.shape)
         finer = (size / _SAMPLES_M).ceil().long()
         reach = (reach_m * finer / size - 1e-3).ceil().long().clamp_min(0).tolist()[::-1]
@@ -120,7 +135,8 @@ class FastSnarf(System):
         places = deformer.grid.nodes(shape).reshape(-1, 3)
         touched = torch.zeros(shape, dtype=torch.bool, device=places.device)
         for condition in self.condition(pose):
-            values = self.canonical_logits(places[left], condition[None], torch.zeros_like(left), precision)
+            seen = self._weights_seen(places[left], weights)
+            values = self.canonical_logits(places[left], condition[None], torch.zeros_like(left), precision, seen)
             touched.view(-1)[left[values > threshold]] = True
             left = left[values <= threshold]
         near = touched[None, None].float()
@@ -152,10 +168,20 @@ class FastSnarf(System):
         if self._kept_cells is not None and bool(cells.any()):
             self.deformer.set_active_cells(cells)
 
-    def canonical_weights(self, canonical: Tensor) -> Tensor:
-        return self.deformer.recent_weights(canonical)
-
     # ---------------------------------------------------------------- training
+    def bone_logits(
+        self,
+        points: Tensor,
+        owner: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        precision: str = "highest",
+        found: FoundRoots | None = None,
+    ) -> Tensor:
+        index = torch.arange(len(points), device=points.device) % len(pose)
+        weights = self._weights_seen(points, None if found is None else found.weights)
+        return self.canonical_logits(points, self.condition(pose), index, precision, weights)
+
     def joint_weights(self, joints: Tensor, bone_transforms: Tensor, pose: Tensor) -> Tensor | None:
         weights = self.deformer.field(joints)
         return weights if weights.requires_grad else None  # given weights are not trained
@@ -208,16 +234,6 @@ class FastSnarf(System):
         return self.deformer.posed_box(bone_transforms, self._body_cells)
 
 
-class Snarf(FastSnarf):
-    """Fast-SNARF without its grid: the field of `skinning` is a network, whose own roots are found.
-
-    Arguments: as `FastSnarf`; `skinning.name` is "mlp" whatever is given, and `search.name` must be "broyden".
-    """
-
-    def __init__(self, config: AvatarConfig, *others: Any, **named: Any) -> None:
-        super().__init__(replace(config, skinning=replace(config.skinning, name="mlp")), *others, **named)
-
-
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:
     """Blend logits [M] over each query's correspondences to [B, N], smoothly, so that all of them get a gradient.
 
@@ -229,11 +245,12 @@ def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor
     values = logits if config.blend == "logit" else logits.sigmoid()
     scores = config.blend_sharpness * values
     total = found.batch * found.count
-    highest = found.maximum(scores.detach(), 0.0).reshape(-1)
+    # One row more than queries: it takes what belongs to no query where a search was given a capacity.
+    zeros = logits.new_zeros(total + 1)
+    highest = zeros.scatter_reduce(0, found.query, scores.detach(), "amax", include_self=False)
     weights = (scores - highest[found.query]).exp()
-    zeros = logits.new_zeros(total)
     norm = zeros.index_add(0, found.query, weights)
-    mean = zeros.index_add(0, found.query, weights * values) / norm.clamp_min(1e-12)
+    mean = (zeros.index_add(0, found.query, weights * values) / norm.clamp_min(1e-12))[:total]
     mask = found.found.reshape(-1)
     if config.blend == "probability":
         mean = torch.logit(mean, eps=1e-6)

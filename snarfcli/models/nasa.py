@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +23,7 @@ from snarfcli.precision import network_precision
 from snarfcli.segments import distance_to_segments
 from snarfcli.shape.network import LOGITS_PER_METRE
 
-__all__ = ["Nasa", "PartNetworks", "Piecewise"]
+__all__ = ["Nasa", "PartNetworks"]
 
 _LEAK = 0.1  # slope of the leaky ReLU for negative values (Deng et al.)
 _ON_SURFACE = 0.5  # wanted occupancy of a part at its own surface points (Deng et al.)
@@ -52,7 +52,8 @@ class Nasa(PointwiseSystem):
     Each part sees a point in the frame of its bone, and a few numbers to which the pose, written as the place of the root joint
     in the frames of all bones, is reduced for it alone. The union of the parts is the maximum over them. A loss gives each
     surface point to the part with the largest true skinning weight. The loss that fills the bones applies where the pose moves
-    them. With `model.part_code=0` parts are rigid, which Deng et al. call NASA (R); otherwise they deform, NASA (D).
+    them. With `model.part_code=0` parts are rigid, which Deng et al. call NASA (R); otherwise they deform, NASA (D). The system
+    "piecewise" always has rigid parts.
 
     Occupancies are learned by cross-entropy, as in all systems here; the paper has squared errors. Where the canonical shape of
     the other systems corrects capsules around the bones (`shape.prior_radius_m`), each part corrects those of its own bone.
@@ -62,6 +63,18 @@ class Nasa(PointwiseSystem):
 
     needs_template: ClassVar[bool] = True
     has_canonical_shape: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        config: AvatarConfig,
+        skeleton: Skeleton,
+        grid: CanonicalGrid,
+        surface: Tensor,
+        template: MeshTemplate | None = None,
+    ) -> None:
+        if config.model.name == "piecewise":
+            config = replace(config, model=replace(config.model, part_code=0))
+        super().__init__(config, skeleton, grid, surface, template)
 
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         self.register_buffer("_segments", _own_segments(skeleton), persistent=False)
@@ -108,7 +121,13 @@ class Nasa(PointwiseSystem):
         return LOGITS_PER_METRE * (self.config.shape.prior_radius_m - distance)
 
     def bone_logits(
-        self, points: Tensor, owner: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+        self,
+        points: Tensor,
+        owner: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        precision: str = "highest",
+        found: Found | None = None,
     ) -> Tensor:
         """Return logits where each pose moves points of the bones, [B, M]: there is no canonical shape to fill."""
         return self(move_with_bones(points, owner, bone_transforms), bone_transforms, pose, precision).logits
@@ -129,16 +148,6 @@ class Nasa(PointwiseSystem):
         wanted = _ON_SURFACE * F.one_hot(weights.argmax(1), self.num_bones).T.to(weights)
         occupancy = self.part_logits(posed, bone_transforms, precision).sigmoid()
         return {"parts": config.part_weight * F.mse_loss(occupancy, wanted.expand_as(occupancy))}
-
-
-class Piecewise(Nasa):
-    """NASA with parts that move rigidly and keep their shape.
-
-    Arguments: as `Nasa`; `model.part_code` is 0 whatever is given.
-    """
-
-    def __init__(self, config: AvatarConfig, *others: Any, **named: Any) -> None:
-        super().__init__(replace(config, model=replace(config.model, part_code=0)), *others, **named)
 
 
 def _own_segments(skeleton: Skeleton) -> Tensor:

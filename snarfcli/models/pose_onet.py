@@ -8,6 +8,7 @@ from typing import ClassVar
 from torch import Tensor, nn
 
 from snarfcli.models.pointwise import PointwiseSystem, into_root_frame, move_with_bones
+from snarfcli.models.system import Found
 from snarfcli.shape import OccupancyNetwork
 
 __all__ = ["PoseONet"]
@@ -36,7 +37,13 @@ class PoseONet(PointwiseSystem):
         return into_root_frame(points, bone_transforms), None
 
     def bone_logits(
-        self, points: Tensor, owner: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+        self,
+        points: Tensor,
+        owner: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        precision: str = "highest",
+        found: Found | None = None,
     ) -> Tensor:
         """Return logits where each pose moves points of the bones, [B, M]: there is no canonical shape to fill."""
         return self(move_with_bones(points, owner, bone_transforms), bone_transforms, pose, precision).logits

@@ -120,6 +120,11 @@ class System(nn.Module):
         """Return the pose condition [B, C] of the canonical shape."""
         return pose_angles(pose)
 
+    @property
+    def depends_on_weights(self) -> bool:
+        """Whether the canonical shape depends on the skinning weights of a point."""
+        return self.config.condition.name == "local"
+
     def canonical_logits(
         self, canonical: Tensor, condition: Tensor, pose: Tensor, precision: str = "highest", weights: Tensor | None = None
     ) -> Tensor:
@@ -130,11 +135,13 @@ class System(nn.Module):
             condition: [B, C].
             pose: index of each point's pose, [M].
             precision: of the network, but not where the native library evaluates it, which is in full float32 and faster.
-            weights: skinning weights of the points [M, J], where the system has them; else they are looked up if need be.
+            weights: skinning weights of the points [M, J], used if `depends_on_weights`; None to evaluate them here.
         """
         seen = None
-        if self.config.condition.name == "local":
-            seen = self.seen_joints(self.canonical_weights(canonical) if weights is None else weights)
+        if self.depends_on_weights:
+            with torch.no_grad():
+                weights = self.skinning_weights(canonical) if weights is None else weights
+            seen = self.seen_joints(weights)
         if can_evaluate(self.shape, canonical):
             return evaluate(self.shape, canonical, condition, pose, seen)
         with network_precision(precision, canonical.device):
@@ -149,11 +156,6 @@ class System(nn.Module):
             return torch.cat(logits).to(canonical.dtype)
 
     @torch.no_grad()
-    def canonical_weights(self, canonical: Tensor) -> Tensor:
-        """Return the skinning weights [M, J] at canonical points [M, 3], without a gradient."""
-        return self.skinning_weights(canonical)
-
-    @torch.no_grad()
     def seen_joints(self, weights: Tensor) -> Tensor:
         """Return how much points of skinning weights [M, J] see of each joint but the root, [M, J - 1], 0 to 1.
 
@@ -166,7 +168,13 @@ class System(nn.Module):
 
     # ---------------------------------------------------------------- training
     def bone_logits(
-        self, points: Tensor, owner: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest"
+        self,
+        points: Tensor,
+        owner: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        precision: str = "highest",
+        found: Found | None = None,
     ) -> Tensor:
         """Return occupancy logits at points of the bones, for the loss that fills them (SNARF Sec. 3.3).
 
@@ -176,6 +184,7 @@ class System(nn.Module):
             bone_transforms: [B, J, 4, 4], canonical to posed.
             pose: [B, J, 3].
             precision: of the network.
+            found: from `find` with the same parameters; what it has evaluated is then not evaluated again.
         """
         index = torch.arange(len(points), device=points.device) % len(pose)
         return self.canonical_logits(points, self.condition(pose), index, precision)

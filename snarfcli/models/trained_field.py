@@ -1,4 +1,4 @@
-"""A trained model with its skeleton, saved as one safe file, and the queries that it answers."""
+"""A trained model with its skeleton: saving, loading and queries."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Hashable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -22,8 +22,8 @@ from snarfcli.files import write_tensors
 from snarfcli.models.back_d import BackD
 from snarfcli.models.back_lbs import BackLBS
 from snarfcli.models.checkpoint import load_checkpoint
-from snarfcli.models.fast_snarf import FastSnarf, Snarf
-from snarfcli.models.nasa import Nasa, Piecewise
+from snarfcli.models.fast_snarf import FastSnarf
+from snarfcli.models.nasa import Nasa
 from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.smpl_nn import SmplNN
@@ -35,30 +35,36 @@ FORMAT = "snarf-avatar"
 FORMAT_VERSION = 1
 SYSTEMS: dict[str, type[System]] = {
     "fast_snarf": FastSnarf,
-    "snarf": Snarf,
+    "snarf": FastSnarf,
     "pose_onet": PoseONet,
     "back_lbs": BackLBS,
     "back_d": BackD,
     "nasa": Nasa,
-    "piecewise": Piecewise,
+    "piecewise": Nasa,
     "smpl_nn": SmplNN,
 }
-"""The systems by the names that `model` gives them."""
+"""The systems by name, see `ModelConfig.name`."""
+
+_WRONG_CONTENT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError, MemoryError)
+_WRONG_CONTENT += (OmegaConfBaseException,)  # what a damaged description raises
 
 T = TypeVar("T")
 
 
 class TrainedField:
-    """The posed occupancy field of one subject: it is saved, loaded and queried.
+    """The posed occupancy field of one subject, which can be saved, loaded and queried.
 
     Args:
         config: architecture.
         skeleton: joint tree, rest joints and canonical pose.
         grid: canonical box that holds the body.
-        surface: rough points of the body, [K, 3], canonical, metres, for a new avatar; a saved one knows where to search.
-        facts: plain facts about its making (data, subject, steps, ...), saved with it.
-        field: weight field of a new avatar instead of the one that `config.skinning` describes; preset weights need it.
-        template: the subject's mesh with its skinning weights, for the systems that are told them.
+        surface: [K, 3], rough points of the body, canonical frame, metres, for a new avatar; a saved one has its cells.
+        facts: plain facts about the training (data, subject, steps, ...), saved with the avatar.
+        field: weight field of a new avatar, instead of the one that `config.skinning` describes; for preset weights.
+        template: the subject's mesh in the canonical pose, for systems that use ground-truth skinning weights.
+
+    Raises:
+        ValueError: the configuration is not of a system, or does not fit the skeleton.
     """
 
     def __init__(
@@ -72,7 +78,7 @@ class TrainedField:
         template: MeshTemplate | None = None,
     ) -> None:
         if config.model.name not in SYSTEMS:
-            raise ValueError(f"model.name must be one of {', '.join(SYSTEMS)}, got {config.model.name!r}")
+            raise ValueError(f"model.name: wanted one of {', '.join(SYSTEMS)}, got {config.model.name!r}")
         self.config = config
         self.skeleton = skeleton
         self.facts = dict(facts or {})
@@ -80,16 +86,17 @@ class TrainedField:
         system = SYSTEMS[config.model.name]
         self.template = template if system.keeps_template else None
         options = {} if field is None else {"field": field}
-        self.model = system(config, skeleton, grid, surface, template, **options)
+        build = cast("Callable[..., System]", system)  # every system takes these; the base class takes fewer
+        self.model = build(config, skeleton, grid, surface, template, **options)
         self._derived: dict[Hashable, Any] = {}
 
     # ---------------------------------------------------------------- files
     def save(self, path: str | Path) -> None:
-        """Write the avatar to one file, whole or not at all; `torch.load(weights_only=True)` reads it."""
+        """Write the avatar to one file, which is whole or absent; `torch.load(weights_only=True)` reads it."""
         write_tensors(path, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain dicts, lists, numbers and tensors that describe the avatar completely."""
+        """Return a complete description of the avatar: plain dicts, lists, numbers and tensors."""
         return {
             "format": FORMAT,
             "version": FORMAT_VERSION,
@@ -103,63 +110,66 @@ class TrainedField:
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Self:
-        """Read an avatar from its file, or from the `avatar.pt` in a run folder, and make it ready to use on `device`.
+        """Read an avatar from its file, or from `avatar.pt` in a run folder, ready to use on `device`.
 
         Raises:
-            UserError: the file is missing, damaged, no avatar, or of another format version.
+            UserError: the file is missing, damaged, not an avatar, or of another format version.
         """
         path = Path(path) / "avatar.pt" if Path(path).is_dir() else Path(path)
         return cls.from_dict(load_checkpoint(path, FORMAT, FORMAT_VERSION, "avatar"), path).to(device)
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], path: str | Path = "avatar") -> Self:
-        """Build the avatar that `to_dict` described; `path` only names it in messages."""
+        """Return the avatar that `to_dict` described; `path` is its name in messages.
+
+        Raises:
+            UserError: the content does not describe an avatar.
+        """
         try:
-            config = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"]))
+            merged = OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"])
+            config = cast("AvatarConfig", OmegaConf.to_object(merged))
             grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
             skeleton = Skeleton.from_dict(content["skeleton"])
             template = _read_template(content.get("template"), config.model.name, skeleton.num_joints)
             field = None
             if config.skinning.name == "preset" and config.model.name == "fast_snarf":
-                field = PresetWeights.placeholder(grid, tuple(config.skinning.resolution[::-1]), skeleton.num_joints)
+                width, height, depth = config.skinning.resolution
+                field = PresetWeights.placeholder(grid, (depth, height, width), skeleton.num_joints)
             avatar = cls(config, skeleton, grid, facts=content["facts"], field=field, template=template)
             avatar.model.load_state_dict(content["state"])
-        except (
-            LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError, MemoryError,
-            OmegaConfBaseException,
-        ) as error:  # fmt: skip
+        except _WRONG_CONTENT as error:
             reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
             raise UserError(f"{path} does not describe an avatar of this version ({reason}); train it again") from None
         avatar.model.eval()
         return avatar
 
     def to(self, device: str | torch.device) -> Self:
-        """Move the avatar to a device and freeze there what does not depend on the pose."""
+        """Move the avatar to a device and compute there what does not depend on the pose."""
         self.model.to(device)
         self.model.freeze()
         self._derived.clear()
         return self
 
     def with_model(self, model: System) -> Self:
-        """Return a copy that answers from another model; its facts and what is derived from the model are separate."""
+        """Return a copy with another model, with separate facts and without derived objects."""
         other = copy.copy(self)
         other.model, other.facts, other._derived = model, copy.deepcopy(self.facts), {}
         return other
 
     @property
     def device(self) -> torch.device:
-        """Where the avatar computes."""
+        """Device on which the avatar computes."""
         return self.model.grid.lower.device
 
     @property
     def has_skinning_weights(self) -> bool:
-        """Whether canonical points have skinning weights, so that a canonical mesh can be moved."""
+        """Whether canonical points have skinning weights, so that a canonical mesh can be skinned."""
         return self.model.has_skinning_weights
 
     def derived(self, key: Hashable, compute: Callable[[], T]) -> T:
-        """Return `compute()`, computed once per key and kept until the field moves to another device.
+        """Return `compute()`, cached by key until the field moves to another device.
 
-        For what is expensive and follows from the field alone, such as its canonical surface.
+        For expensive results that depend only on the field, such as its canonical surface.
         """
         if key not in self._derived:
             self._derived[key] = compute()
@@ -167,12 +177,20 @@ class TrainedField:
 
     # ---------------------------------------------------------------- the field
     def bone_transforms(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
-        """Return the bone transforms [B, J, 4, 4], canonical to posed, of pose [B, J, 3] and translation [B, 3]."""
+        """Return the bone transforms [B, J, 4, 4], canonical to posed, metres, of poses.
+
+        Args:
+            pose: [B, J, 3] axis-angle, radians, global orientation included.
+            translation: [B, 3], metres.
+
+        Raises:
+            ValueError: the pose has a wrong shape, or is not finite.
+        """
         joints = self.skeleton.num_joints
         if pose.ndim != 3 or tuple(pose.shape[1:]) != (joints, 3):
-            raise ValueError(f"pose must have shape [B, {joints}, 3], got {list(pose.shape)}")
+            raise ValueError(f"pose: wanted shape [B, {joints}, 3], got {list(pose.shape)}")
         if not bool(pose.isfinite().all()):
-            raise ValueError("pose must be finite, got NaN or infinite values")
+            raise ValueError("pose: wanted finite values, got NaN or infinite ones")
         return self.skeleton.posed_from_canonical(pose, translation).to(self.device)
 
     def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> FieldSamples:
@@ -193,7 +211,7 @@ class TrainedField:
         """Return occupancy probabilities [B, N] at posed points [B, N, 3], metres.
 
         Args:
-            points: [B, N, 3], posed space, metres.
+            points: [B, N, 3], posed frame, metres.
             pose: [B, J, 3] axis-angle, radians, global orientation included.
             translation: [B, 3], metres.
         """
@@ -203,7 +221,7 @@ class TrainedField:
     def canonical_logits(self, canonical: Tensor, pose: Tensor) -> Tensor:
         """Return occupancy logits [N] at canonical points [N, 3] for the shape of one pose [J, 3].
 
-        Where the search never looks the network was never trained; there it is `NO_CORRESPONDENCE`.
+        Outside the searched cells, where the network is not trained, they are `NO_CORRESPONDENCE`.
 
         Raises:
             ValueError: the system has no canonical shape.
@@ -218,12 +236,12 @@ class TrainedField:
 
     @torch.no_grad()
     def skinning_weights(self, canonical: Tensor) -> Tensor:
-        """Return the skinning weights [N, J] at canonical points [N, 3]; ValueError where the system has none."""
+        """Return the skinning weights [N, J] at canonical points [N, 3]; ValueError if the system has none."""
         return self.model.skinning_weights(canonical.to(self.device))
 
     @torch.no_grad()
     def skin(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
-        """Move canonical points [N, 3] into one pose, given by bone transforms [J, 4, 4]; ValueError without weights."""
+        """Move canonical points [N, 3] into the pose of bone transforms [J, 4, 4]; ValueError if the system has no weights."""
         return self.model.skin(canonical.to(self.device), bone_transforms.to(self.device))
 
     def canonical_box(self) -> tuple[Tensor, Tensor]:
@@ -237,15 +255,15 @@ class TrainedField:
 
 
 def _describe_template(template: MeshTemplate) -> dict[str, Tensor]:
-    """Return what a file holds of a mesh: no faces, which no system uses."""
+    """Return the description of a template in a file: without faces, which no system uses."""
     return {name: torch.tensor(getattr(template, name), dtype=torch.float32) for name in ("vertices", "weights")}
 
 
 def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | None:
-    """Return the mesh that a file holds for a system, None where the system keeps none.
+    """Return the template mesh in a file, or None if the system has no template.
 
     Raises:
-        ValueError: the system needs one, and the file holds none that can be used.
+        ValueError: the system needs a template, and the file has no usable one.
     """
     if model not in SYSTEMS or not SYSTEMS[model].keeps_template:
         return None

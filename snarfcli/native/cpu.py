@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from ctypes import Structure, byref, c_double, c_int32, c_int64, c_void_p
 
 import torch
 from torch import Tensor
 
+from snarfcli.native.capacity import fit_to_capacity
 from snarfcli.native.library import native_library
 
 __all__ = ["blend", "blend_backward", "broyden_search", "complete_search", "implicit_backward"]
@@ -91,35 +93,27 @@ def complete_search(
     points: Tensor,
     transforms: Tensor,
     lower: Tensor,
-    size: Tensor,
-    shape: tuple[int, int, int],
-    active: Tensor | None,
+    upper: Tensor,
+    shape: Sequence[int],
+    active_cells: Tensor | None,
     tolerance: float,
     max_steps: int,
     orientation_preserving: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Find the roots in every active cell.
+    capacity: int | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Find the roots of T(x) [x; 1] = x' in every active cell; see `ops.complete_search` for arguments and results.
 
-    Args:
-        points: queries [B, N, 3], posed space, metres.
-        transforms: blended transforms [B, D * H * W, 12] at the nodes.
-        lower: canonical position of the first node, [3], metres.
-        size: sides of a cell, [3], metres.
-        shape: nodes (D, H, W).
-        active: bool [D-1, H-1, W-1]; None for all cells.
-        tolerance: largest residual of a root, metres.
-        max_steps: most Newton steps from one start.
-        orientation_preserving: keep only roots where the Jacobian's determinant is positive.
+    Roots come in the order of their queries.
 
-    Returns:
-        canonical [M, 3], query [M] (b * N + n, ascending) and the inverse of dd/dx, [M, 3, 3].
+    Raises:
+        MemoryError: there is not enough memory.
     """
     points, transforms = points.contiguous(), transforms.contiguous()
-    active = None if active is None else active.contiguous()
+    active = None if active_cells is None else active_cells.contiguous()
     cells = None if active is None else active.data_ptr()
-    settings = _Complete(cells, tolerance, max_steps, orientation_preserving)
-    field = _field(transforms, lower, size, shape)
-    return _search("snarf_complete_search", field, points, settings)
+    settings = _Complete(cells, tolerance * _longest_side(lower, upper), max_steps, orientation_preserving)
+    found = _search("snarf_complete_search", _field(transforms, lower, upper, shape), points, settings)
+    return fit_to_capacity(*found, points, capacity)
 
 
 def broyden_search(
@@ -127,26 +121,26 @@ def broyden_search(
     transforms: Tensor,
     starts: Tensor,
     lower: Tensor,
-    size: Tensor,
-    shape: tuple[int, int, int],
+    upper: Tensor,
+    shape: Sequence[int],
     tolerance: float,
     divergence: float,
     max_steps: int,
     exact_jacobian: bool,
     orientation_preserving: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Run Broyden's method from every start; arguments and results as in `complete_search`.
+    capacity: int | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Run Broyden's method from every start; see `ops.broyden_search` for arguments and results.
 
-    Args:
-        starts: upper three rows of the inverse bone transforms, [B, I, 12], posed to canonical.
-        divergence: residual at which a start is given up, metres.
-        exact_jacobian: whether the inverse Jacobian is the exact one at the root or the iteration's approximation.
+    Raises:
+        MemoryError: there is not enough memory.
     """
     points, transforms, starts = points.contiguous(), transforms.contiguous(), starts.contiguous()
-    settings = _Broyden(
-        starts.data_ptr(), starts.shape[1], tolerance, divergence, max_steps, exact_jacobian, orientation_preserving
-    )
-    return _search("snarf_broyden_search", _field(transforms, lower, size, shape), points, settings)
+    length = _longest_side(lower, upper)
+    limits = (tolerance * length, divergence * length, max_steps)
+    settings = _Broyden(starts.data_ptr(), starts.shape[1], *limits, exact_jacobian, orientation_preserving)
+    found = _search("snarf_broyden_search", _field(transforms, lower, upper, shape), points, settings)
+    return fit_to_capacity(*found, points, capacity)
 
 
 def implicit_backward(
@@ -155,23 +149,19 @@ def implicit_backward(
     query: Tensor,
     jacobian_inverse: Tensor,
     lower: Tensor,
-    size: Tensor,
-    shape: tuple[int, int, int],
+    upper: Tensor,
+    shape: Sequence[int],
     batch: int,
     count: int,
-    wants: tuple[bool, bool],
+    wants_points: bool,
+    wants_transforms: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Return the gradients by the queries [B, N, 3] and by the nodes' transforms [B, D * H * W, 12]; empty where not wanted.
-
-    Args:
-        gradient: of the loss by the roots, [M, 3]; the other arrays as the search returned them.
-        wants: which of the two results are needed.
-    """
+    """Return the gradients by the queries and by the transforms; see `ops.implicit_backward`."""
     gradient, canonical = gradient.contiguous(), canonical.contiguous()
     query, jacobian_inverse = query.contiguous(), jacobian_inverse.contiguous()
-    v_points = gradient.new_empty((batch, count, 3) if wants[0] else 0)
-    v_transforms = gradient.new_empty((batch, shape[0] * shape[1] * shape[2], 12) if wants[1] else 0)
-    field = _field(gradient, lower, size, shape)
+    v_points = gradient.new_empty((batch, count, 3) if wants_points else 0)
+    v_transforms = gradient.new_empty((batch, shape[0] * shape[1] * shape[2], 12) if wants_transforms else 0)
+    field = _field(gradient, lower, upper, shape)
     queries = _Queries(None, batch, count, torch.get_num_threads())
     code = _library().snarf_implicit_backward(
         byref(field),
@@ -181,8 +171,8 @@ def implicit_backward(
         c_void_p(canonical.data_ptr()),
         c_void_p(query.data_ptr()),
         c_void_p(jacobian_inverse.data_ptr()),
-        c_void_p(v_points.data_ptr() if wants[0] else None),
-        c_void_p(v_transforms.data_ptr() if wants[1] else None),
+        c_void_p(v_points.data_ptr() if wants_points else None),
+        c_void_p(v_transforms.data_ptr() if wants_transforms else None),
     )
     _raise_for(code)
     return v_points, v_transforms
@@ -214,11 +204,20 @@ def _library() -> ctypes.CDLL:
     return library
 
 
-def _field(numbers: Tensor, lower: Tensor, size: Tensor, shape: tuple[int, int, int]) -> _Field:
-    """Describe the grid; `numbers` [B, V, 12] gives the address and the type."""
-    nodes = (c_int32 * 3)(shape[2], shape[1], shape[0])
+def _longest_side(lower: Tensor, upper: Tensor) -> float:
+    return float((upper - lower).max())
+
+
+def _field(numbers: Tensor, lower: Tensor, upper: Tensor, shape: Sequence[int]) -> _Field:
+    """Describe the grid; the contiguous `numbers`, which the caller keeps alive, give the address and the type."""
+    nodes = (shape[2], shape[1], shape[0])
+    size = (upper - lower) / torch.tensor([n - 1 for n in nodes]).to(lower)
     return _Field(
-        numbers.data_ptr(), (c_double * 3)(*lower.tolist()), (c_double * 3)(*size.tolist()), nodes, numbers.element_size()
+        numbers.data_ptr(),
+        (c_double * 3)(*lower.tolist()),
+        (c_double * 3)(*size.tolist()),
+        (c_int32 * 3)(*nodes),
+        numbers.element_size(),
     )
 
 
@@ -243,4 +242,4 @@ def _raise_for(code: int) -> None:
     if code == 2:
         raise MemoryError("the correspondence search ran out of memory; give fewer points or poses at once")
     if code:
-        raise RuntimeError(f"the native library refused its arguments (code {code})")
+        raise RuntimeError(f"the native library rejected its arguments (code {code})")

@@ -1,4 +1,4 @@
-"""Finds and loads the native CPU library, keeps the reason where that fails, and chooses the backend by it."""
+"""Load the native CPU library, and keep the reason if that fails."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import os
 import struct
 import sys
-import warnings
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from typing import Any
 __all__ = [
     "ABI_VERSION",
     "build_note",
-    "choose_backend",
     "instruction_set",
     "library_path",
     "native_library",
@@ -59,28 +57,6 @@ def instruction_set() -> str | None:
     return function().decode()
 
 
-def choose_backend(backend: str) -> str:
-    """Return "native" or "reference" for "auto", "native" or "reference".
-
-    "auto" takes the library where there is one; where not, it says so in one warning and takes the reference.
-
-    Raises:
-        ValueError: `backend` is none of the three.
-        RuntimeError: "native" was asked for and the library is not available; the message tells the reason.
-    """
-    if backend not in ("auto", "native", "reference"):
-        raise ValueError(f"backend: wanted auto, native or reference, got {backend!r}")
-    if backend == "reference":
-        return backend
-    reason = why_unavailable()
-    if reason is None:
-        return "native"
-    if backend == "native":
-        raise RuntimeError(f"backend native is not available: {reason}")
-    _warn_once(reason)
-    return "reference"
-
-
 def build_note() -> dict[str, Any]:
     """Return what the build noted: `built`, and `compiler` and `instruction_sets`, or the `reason` why not; or nothing."""
     for folder in _folders():
@@ -91,12 +67,6 @@ def build_note() -> dict[str, Any]:
         if isinstance(note, dict):
             return note
     return {}
-
-
-@cache
-def _warn_once(reason: str) -> None:
-    message = f"snarf searches with its reference in PyTorch, many times slower than its native library: {reason}"
-    warnings.warn(message, RuntimeWarning, stacklevel=3)
 
 
 @cache

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from skinning_scenes import random_transforms, unit_grid
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from snarfcli.deformer import CanonicalGrid, ForwardDeformer, PresetWeights, SearchConfig, SkinningConfig, find_correspondences
-from snarfcli.deformer.deformer import FIELDS
+from snarfcli.deformer import (
+    CanonicalGrid,
+    ForwardDeformer,
+    PresetWeights,
+    SearchConfig,
+    SkinningConfig,
+    correspondences,
+    find_correspondences,
+)
+from snarfcli.deformer.skinning_config import FIELDS
 
 PARENTS = [-1, 0, 1]
 BONES = 3
@@ -136,7 +147,7 @@ def test_a_module_of_the_users_own_is_trained_and_saved_with_it(name):
 
 def test_a_field_that_returns_something_else_is_named():
     module = ForwardDeformer(unit_grid(torch.float32), BONES, settings("distilled"), field=lambda x: x[:, :2])
-    with pytest.raises(ValueError, match=r"field must return weights of shape \[336, 3\], got \[336, 2\]"):
+    with pytest.raises(ValueError, match=r"field: wanted weights of shape \[336, 3\], got \[336, 2\]"):
         module.weight_grid()
 
 
@@ -172,24 +183,81 @@ def test_a_search_evaluates_only_nodes_of_active_cells(name):
     assert variation == pytest.approx(float(sum(changes)), rel=1e-4)
 
 
+class Operators(TorchDispatchMode):
+    """Keeps the names of all operators that are called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.names.append(function.name())
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", ["distilled", "voxel", "preset"])
+def test_a_search_with_a_capacity_waits_for_nothing(name, monkeypatch):
+    """On a GPU, where values are not checked: sizes that depend on data, and numbers read from tensors, would wait."""
+    monkeypatch.setattr(correspondences, "_skips_checks", lambda tensor: True)
+    module, other = deformer(name), deformer(name, seed=1)
+    cells = torch.ones(5, 6, 7, dtype=torch.bool)
+    cells[0] = False
+    module.set_active_cells(cells)
+    other.load_state_dict(module.state_dict())
+    transforms = random_transforms(2, BONES, 0.3, dtype=torch.float32)
+    points = torch.rand(2, 30, 3, generator=torch.Generator().manual_seed(2))
+    wanted = module(points, transforms)
+    for one in (module, other, copy.deepcopy(other)):
+        with Operators() as called:
+            found = one(points, transforms, capacity=100)
+            found.maximum(found.canonical[:, 0], -1.0)
+        assert "snarf::complete_search" in called.names
+        waiting = ("aten::nonzero", "aten::_local_scalar_dense", "aten::masked_select", "aten::unique")
+        assert not [name for name in called.names if name.startswith(waiting)]
+        assert torch.equal(found.canonical[: len(wanted.query)], wanted.canonical)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_weights_are_handed_on_from_a_search(name):
+    module = deformer(name)
+    transforms = random_transforms(1, BONES, 0.3, dtype=torch.float32)
+    points = torch.rand(1, 30, 3, generator=torch.Generator().manual_seed(2))
+    weights = module.node_weights()
+    assert (weights is None) == (name == "mlp")
+    found = module(points, transforms, weights=weights)
+    assert torch.equal(found.canonical, module(points, transforms).canonical)
+    torch.testing.assert_close(module.skinning_weights(found.canonical, weights), module.skinning_weights(found.canonical))
+    if weights is not None:
+        calls = []
+        module.field.register_forward_hook(lambda *_: calls.append(1))
+        module.skinning_weights(module(points, transforms, weights=weights).canonical, weights)
+        assert not calls
+        assert torch.equal(weights.at(found.canonical), module.skinning_weights(found.canonical, weights))
+
+
+def test_the_name_of_a_search_stands_for_its_settings():
+    module = ForwardDeformer(unit_grid(torch.float32), BONES, settings("distilled"), "broyden", field=stripes)
+    assert module.search == SearchConfig("broyden")
+
+
 def test_what_does_not_go_together_is_refused():
     grid = unit_grid(torch.float32)
-    with pytest.raises(ValueError, match=r"skinning.name must be one of distilled, voxel, mlp, preset, got 'grid'"):
+    with pytest.raises(ValueError, match=r"skinning.name: wanted distilled, voxel, mlp or preset, got 'grid'"):
         ForwardDeformer(grid, BONES, settings("grid"))
-    with pytest.raises(ValueError, match=r"needs field=PresetWeights.from_vertices"):
+    with pytest.raises(ValueError, match=r"field: wanted weights .*; give PresetWeights.from_vertices"):
         ForwardDeformer(grid, BONES, settings("preset"))
-    with pytest.raises(ValueError, match=r"field must have nodes \[6, 7, 9\] .* got \[6, 7, 8\]"):
-        changed = settings("preset")
-        changed.resolution = [9, 7, 6]
+    changed = settings("preset")
+    changed.resolution = [9, 7, 6]
+    with pytest.raises(ValueError, match=r"field: wanted the grid's nodes \[6, 7, 9\] .* got \[6, 7, 8\]"):
         ForwardDeformer(grid, BONES, changed, field=preset(grid))
-    with pytest.raises(ValueError, match=r"'mlp' needs search.name 'broyden', got 'complete'"):
+    with pytest.raises(ValueError, match=r"search.name: wanted broyden for skinning.name 'mlp', got 'complete'"):
         ForwardDeformer(grid, BONES, settings("mlp"), SearchConfig("complete"))
     module = deformer("mlp")
-    with pytest.raises(ValueError, match=r"'mlp' needs search.name 'broyden'"):
+    with pytest.raises(ValueError, match=r"search.name: wanted broyden for skinning.name 'mlp'"):
         module.search = SearchConfig("complete")
-    with pytest.raises(ValueError, match=r"active_cells must be bool \[5, 6, 7\], got torch.float32 \[5, 6, 7\]"):
+    with pytest.raises(ValueError, match=r"active_cells: wanted bool \[5, 6, 7\], got torch.float32 \[5, 6, 7\]"):
         module.set_active_cells(torch.ones(5, 6, 7))
-    with pytest.raises(ValueError, match="active_cells must hold at least one cell"):
+    with pytest.raises(ValueError, match="active_cells: wanted at least one cell, got none"):
         module.set_active_cells(torch.zeros(5, 6, 7, dtype=torch.bool))
 
 

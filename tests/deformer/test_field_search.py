@@ -7,9 +7,20 @@ import torch
 from skinning_scenes import random_transforms, unit_grid
 from torch import nn
 
-from snarfcli.deformer import CanonicalGrid, find_correspondences, find_correspondences_on_field, skin
+from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences, find_correspondences_on_field, skin
 
 BONES = 4
+METRE = CanonicalGrid(torch.zeros(3), torch.ones(3))
+
+
+def find(points, transforms, field, *, box=None, start_jacobian="exact", points_at_once=32_768, **settings):
+    """Search with the paper's settings, changed by `settings`, lengths in metres; without bounds unless a box is given."""
+    grid = box or METRE
+    settings = {"tolerance": 1e-5, "max_steps": 50, "divergence": 1.0} | settings
+    for name in ("tolerance", "divergence"):
+        settings[name] /= grid.longest_side
+    options = {"bounded": box is not None, "start_jacobian": start_jacobian, "points_at_once": points_at_once}
+    return find_correspondences_on_field(points, transforms, field, grid, search=SearchConfig("broyden", **settings), **options)
 
 
 class DistanceField(nn.Module):
@@ -50,7 +61,7 @@ def posed(found, field, transforms):
 def test_every_result_is_a_root_once_and_in_order(angle, start_jacobian):
     field, transforms = DistanceField(), random_transforms(3, BONES, angle)
     points = 2 * torch.rand(3, 150, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) - 1
-    found = find_correspondences_on_field(points, transforms, field, tolerance=1e-9, start_jacobian=start_jacobian)
+    found = find(points, transforms, field, tolerance=1e-9, start_jacobian=start_jacobian)
     assert len(found.query) > 300
     assert int(found.total) == len(found.query)
     assert bool((found.query[1:] >= found.query[:-1]).all())
@@ -67,7 +78,7 @@ def test_roots_are_those_of_a_fine_grid(scene):
     with torch.no_grad():
         weights = field(grid.nodes((81, 81, 81)).reshape(-1, 3)).reshape(81, 81, 81, BONES)
     wanted = find_correspondences(points, transforms, weights, grid)
-    found = find_correspondences_on_field(points, transforms, field, grid=grid, tolerance=1e-9)
+    found = find(points, transforms, field, box=grid, tolerance=1e-9)
     assert torch.equal(found.query, wanted.query)
     assert len(found.query) >= 80
     # Cells of 2.5 cm: what the trilinear field leaves out
@@ -80,8 +91,8 @@ def test_roots_are_those_of_a_fine_grid(scene):
 
 def test_single_precision_is_as_good(scene):
     field, transforms, points = scene
-    wanted = find_correspondences_on_field(points, transforms, field, tolerance=1e-9)
-    found = find_correspondences_on_field(points.float(), transforms.float(), field)
+    wanted = find(points, transforms, field, tolerance=1e-9)
+    found = find(points.float(), transforms.float(), field)
     assert found.canonical.dtype == torch.float32
     assert torch.equal(found.query, wanted.query)
     torch.testing.assert_close(found.canonical.double(), wanted.canonical, atol=5e-6, rtol=0)
@@ -94,7 +105,7 @@ def test_chunks_change_nothing(scene):
         field.zero_grad()
         field.largest_call = 0
         queries = points.clone().requires_grad_()
-        found = find_correspondences_on_field(queries, transforms, field, tolerance=1e-9, points_at_once=at_once)
+        found = find(queries, transforms, field, tolerance=1e-9, points_at_once=at_once)
         assert field.largest_call <= max(at_once, BONES)
         found.canonical.sin().sum().backward()
         kept[at_once] = found.canonical.detach(), queries.grad, field.centres.grad.clone()
@@ -114,7 +125,7 @@ def test_gradcheck():
             return torch.func.functional_call(field, {"centres": centres}, x)
 
         whole = torch.cat([upper, bottom], 2)
-        return find_correspondences_on_field(points, whole, with_centres, tolerance=1e-12).canonical
+        return find(points, whole, with_centres, tolerance=1e-12).canonical
 
     inputs = points, transforms[:, :, :3].clone(), field.centres.detach().clone()
     assert roots(*inputs).shape == (6, 3)
@@ -128,7 +139,7 @@ def test_gradient_of_a_network_equals_differences(scene):
     _, transforms, points = scene
 
     def loss():
-        return find_correspondences_on_field(points, transforms, network, tolerance=1e-12).canonical.sin().sum()
+        return find(points, transforms, network, tolerance=1e-12).canonical.sin().sum()
 
     for parameter in network.parameters():
         (gradient,) = torch.autograd.grad(loss(), parameter)
@@ -144,8 +155,8 @@ def test_gradient_of_a_network_equals_differences(scene):
 
 def test_approximate_jacobian_is_near_but_not_equal(scene):
     field, transforms, points = scene
-    exact = find_correspondences_on_field(points, transforms, field)
-    rough = find_correspondences_on_field(points, transforms, field, jacobian="broyden")
+    exact = find(points, transforms, field)
+    rough = find(points, transforms, field, jacobian="broyden")
     torch.testing.assert_close(exact.canonical, rough.canonical, atol=1e-4, rtol=0)
     error = (exact.jacobian_inverse - rough.jacobian_inverse).norm() / exact.jacobian_inverse.norm()
     assert 1e-6 < error < 0.3
@@ -154,7 +165,7 @@ def test_approximate_jacobian_is_near_but_not_equal(scene):
 def test_second_derivative_is_refused(scene):
     field, transforms, points = scene
     points = points.clone().requires_grad_()
-    found = find_correspondences_on_field(points, transforms, field)
+    found = find(points, transforms, field)
     (first,) = torch.autograd.grad(found.canonical.square().sum(), points, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         first.sum().backward()
@@ -162,14 +173,14 @@ def test_second_derivative_is_refused(scene):
 
 def test_works_wherever_autograd_is_off_and_under_autocast(scene):
     field, transforms, points = scene
-    wanted = find_correspondences_on_field(points, transforms, field).canonical
+    wanted = find(points, transforms, field).canonical
     assert wanted.requires_grad
     with torch.no_grad():
-        plain = find_correspondences_on_field(points, transforms, field).canonical
+        plain = find(points, transforms, field).canonical
     with torch.inference_mode():
-        inference = find_correspondences_on_field(points + 0, transforms + 0, field).canonical
+        inference = find(points + 0, transforms + 0, field).canonical
     with torch.autocast("cpu", torch.bfloat16):
-        cast = find_correspondences_on_field(points.float(), transforms.float(), field).canonical
+        cast = find(points.float(), transforms.float(), field).canonical
     for other in (plain, inference):
         assert not other.requires_grad
         assert torch.equal(other, wanted)
@@ -182,7 +193,7 @@ def test_rigid_fields_have_one_root_each():
     transforms = random_transforms(1, BONES, 1.0)
     points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     only = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    found = find_correspondences_on_field(points, transforms, lambda x: only.expand(len(x), -1), divergence=100.0)
+    found = find(points, transforms, lambda x: only.expand(len(x), -1), divergence=100.0)
     inverse = torch.linalg.inv(transforms[0, 1])
     assert found.query.tolist() == list(range(20))
     torch.testing.assert_close(found.canonical, points[0] @ inverse[:3, :3].T + inverse[:3, 3])
@@ -194,7 +205,7 @@ def test_points_without_a_root_and_points_that_are_none(scene):
     points[0, 3], points[1, 0, 2] = torch.nan, torch.inf
     points[1, 5] = 1e6
     box = CanonicalGrid(torch.full((3,), -1.0), torch.full((3,), 1.0))
-    found = find_correspondences_on_field(points, transforms, field, grid=box)
+    found = find(points, transforms, field, box=box)
     assert not bool(found.found[0, 3])
     assert not bool(found.found[1, 0])
     assert not bool(found.found[1, 5])
@@ -205,8 +216,8 @@ def test_points_without_a_root_and_points_that_are_none(scene):
 def test_a_box_keeps_roots_outside_away(scene):
     field, transforms, points = scene
     half = CanonicalGrid(torch.full((3,), -2.0), torch.tensor([0.0, 2.0, 2.0]))
-    everywhere = find_correspondences_on_field(points, transforms, field)
-    inside = find_correspondences_on_field(points, transforms, field, grid=half)
+    everywhere = find(points, transforms, field)
+    inside = find(points, transforms, field, box=half)
     assert 0 < len(inside.query) < len(everywhere.query)
     assert bool((inside.canonical[:, 0] <= 0).all())
     assert set(inside.query.tolist()) == set(everywhere.query[everywhere.canonical[:, 0] < 0].tolist())
@@ -215,9 +226,9 @@ def test_a_box_keeps_roots_outside_away(scene):
 def test_start_bones_and_orientation():
     field, transforms = DistanceField(), random_transforms(1, BONES, 1.2)
     points = 2 * torch.rand(1, 300, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64) - 1
-    every = find_correspondences_on_field(points, transforms, field)
-    one = find_correspondences_on_field(points, transforms, field, init_bones=[2])
-    upright = find_correspondences_on_field(points, transforms, field, orientation_preserving=True)
+    every = find(points, transforms, field)
+    one = find(points, transforms, field, init_bones=[2])
+    upright = find(points, transforms, field, orientation_preserving=True)
     assert len(one.query) < len(every.query)
     assert bool((torch.bincount(one.query) <= 1).all())
     positive = torch.linalg.det(every.jacobian_inverse) > 0
@@ -229,7 +240,7 @@ def test_start_bones_and_orientation():
 def test_few_points(batch, count):
     field, transforms = DistanceField(), random_transforms(batch, BONES, 0.2)
     points = torch.zeros(batch, count, 3, dtype=torch.float64, requires_grad=True)
-    found = find_correspondences_on_field(points, transforms, field)
+    found = find(points, transforms, field)
     assert found.found.shape == (batch, count)
     assert int(found.found.sum()) == batch * count * (count == 1)
     found.canonical.sum().backward()
@@ -239,24 +250,26 @@ def test_few_points(batch, count):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"points": torch.zeros(3, 3)}, r"points must have shape \[B, N, 3\], got \[3, 3\]"),
-        ({"bone_transforms": torch.zeros(2, 4, 4)}, r"bone_transforms must have shape \[1, J, 4, 4\] to fit points"),
+        ({"points": torch.zeros(3, 3)}, r"points: wanted shape \[B, N, 3\], got \[3, 3\]"),
+        ({"bone_transforms": torch.zeros(2, 4, 4)}, r"bone_transforms: wanted shape \[1, J, 4, 4\] to fit points"),
         ({"bone_transforms": torch.zeros(1, 4, 4, 4)}, "finite and invertible"),
         ({"bone_transforms": torch.full((1, 4, 4, 4), torch.nan)}, "finite and invertible"),
         ({"bone_transforms": torch.zeros(1, 4, 4, 4).double()}, "dtype of points, torch.float32, got torch.float64"),
-        ({"points": torch.zeros(1, 2, 3).half()}, "points must be float32 or float64"),
-        ({"field": lambda x: x}, r"field must return weights of shape \[8, 4\], got \[8, 3\]"),
-        ({"init_bones": []}, "init_bones must name at least one bone"),
-        ({"init_bones": [4]}, r"init_bones must lie in 0..3, got \[4\]"),
-        ({"jacobian": "rough"}, "jacobian must be 'exact' or 'broyden', got 'rough'"),
-        ({"start_jacobian": "rough"}, "start_jacobian must be 'exact' or 'blended', got 'rough'"),
-        ({"tolerance": 0.0}, "tolerance must be positive, got 0.0"),
-        ({"points_at_once": 0}, "points_at_once must be positive"),
+        ({"points": torch.zeros(1, 2, 3).half()}, "points: wanted float32 or float64"),
+        ({"field": lambda x: x}, r"field: wanted weights of shape \[8, 4\], got \[8, 3\]"),
+        ({"search": SearchConfig("broyden", [])}, "search.init_bones: wanted at least one bone"),
+        ({"search": SearchConfig("broyden", [4])}, r"search.init_bones: wanted bones from 0 to 3, got \[4\]"),
+        ({"search": SearchConfig("broyden", jacobian="rough")}, "search.jacobian: wanted exact or broyden, got 'rough'"),
+        ({"start_jacobian": "rough"}, "start_jacobian: wanted exact or blended, got 'rough'"),
+        ({"search": SearchConfig("broyden", tolerance=0.0)}, "search.tolerance: wanted more than 0, got 0.0"),
+        ({"search": "complete"}, "search.name: wanted broyden, got 'complete': a field has no cells"),
+        ({"points_at_once": 0}, "points_at_once: wanted at least 1, got 0"),
     ],
 )
 def test_arguments_that_do_not_fit_are_named(changes, message):
     arguments = {
-        "points": torch.zeros(1, 2, 3), "bone_transforms": torch.eye(4).expand(1, 4, 4, 4), "field": DistanceField()
+        "points": torch.zeros(1, 2, 3), "bone_transforms": torch.eye(4).expand(1, 4, 4, 4), "field": DistanceField(),
+        "grid": METRE,
     }  # fmt: skip
     with pytest.raises((ValueError, TypeError), match=message):
         find_correspondences_on_field(**(arguments | changes))

@@ -6,7 +6,7 @@ import pytest
 import torch
 from skinning_scenes import posed_queries, random_transforms, smooth_weights, unit_grid
 
-from snarfcli.deformer import find_correspondences
+from snarfcli.deformer import SearchConfig, find_correspondences
 
 SHAPE = (3, 4, 5)
 
@@ -31,7 +31,9 @@ def test_gradcheck(scene, search):
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(2, 3, 1, 4)
         whole = torch.cat([upper, bottom], 2)
         weights = s.softmax(-1)
-        return find_correspondences(p, whole, weights, grid, search=search, tolerance=1e-13, max_steps=60).canonical
+        return find_correspondences(
+            p, whole, weights, grid, search=SearchConfig(search, tolerance=1e-13, max_steps=60)
+        ).canonical
 
     upper = transforms.detach()[:, :, :3].clone().requires_grad_()
     assert roots(points, upper, scores).shape == (6, 3)
@@ -51,7 +53,7 @@ def test_approximate_jacobian_is_near_but_not_equal(scene):
     points, transforms, scores = scene
     weights = scores.softmax(-1)
     exact = find_correspondences(points, transforms, weights, unit_grid(), search="broyden")
-    rough = find_correspondences(points, transforms, weights, unit_grid(), search="broyden", jacobian="broyden")
+    rough = find_correspondences(points, transforms, weights, unit_grid(), search=SearchConfig("broyden", jacobian="broyden"))
     assert torch.equal(exact.canonical, rough.canonical)
     error = (exact.jacobian_inverse - rough.jacobian_inverse).norm() / exact.jacobian_inverse.norm()
     assert 1e-6 < error < 0.3

@@ -13,7 +13,7 @@ import torch
 from ground_truth import true_roots
 from skinning_scenes import move, posed_queries, random_transforms, scene, smooth_weights, unit_grid
 
-from snarfcli.deformer import CanonicalGrid, find_correspondences
+from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences
 
 SHAPE = (6, 7, 8)
 
@@ -21,7 +21,7 @@ SHAPE = (6, 7, 8)
 def test_the_native_library_is_loaded():
     """Nothing below may pass on the fallback unseen."""
     points, transforms, weights = scene()
-    find_correspondences(points, transforms, weights, unit_grid(torch.float32), backend="native")
+    find_correspondences(points, transforms, weights, unit_grid(torch.float32), search=SearchConfig(backend="native"))
 
 
 @pytest.mark.parametrize("search", ["complete", "broyden"])
@@ -33,7 +33,9 @@ def test_native_and_reference_agree(search, dtype):
     points.requires_grad_()
     results, gradients = [], []
     for backend in ("native", "reference"):
-        result = find_correspondences(points, transforms, weights, unit_grid(dtype), search=search, backend=backend)
+        result = find_correspondences(
+            points, transforms, weights, unit_grid(dtype), search=SearchConfig(search, backend=backend)
+        )
         results.append(result)
         loss = (result.canonical * torch.tensor([1.0, -2.0, 0.5], dtype=dtype)).square().sum()
         gradients.append(torch.autograd.grad(loss, (points, weights)))
@@ -102,7 +104,7 @@ def test_orientation_preserving_drops_roots_that_are_inside_out():
     points, transforms, weights = scene(batch=1, count=400, angle=1.8)
     grid = unit_grid(torch.float32)
     every = find_correspondences(points, transforms, weights, grid)
-    upright = find_correspondences(points, transforms, weights, grid, orientation_preserving=True)
+    upright = find_correspondences(points, transforms, weights, grid, search=SearchConfig(orientation_preserving=True))
     positive = torch.linalg.det(every.jacobian_inverse) > 0
     assert 0 < positive.sum() < len(positive)
     assert torch.equal(every.canonical[positive], upright.canonical)
@@ -184,10 +186,11 @@ _SAVE = """
 import sys, torch
 sys.path[:0] = {paths!r}
 from skinning_scenes import scene, unit_grid
-from snarfcli.deformer import find_correspondences
+from snarfcli.deformer import SearchConfig, find_correspondences
 from snarfcli.native.library import native_library
 points, transforms, weights = scene(count=500, angle=1.2)
-found = find_correspondences(points, transforms, weights, unit_grid(torch.float32), backend="native")
+search = SearchConfig(backend="native")
+found = find_correspondences(points, transforms, weights, unit_grid(torch.float32), search=search)
 import ctypes
 name = native_library().snarf_instruction_set
 name.restype = ctypes.c_char_p
@@ -209,7 +212,7 @@ def test_lower_instruction_sets_find_the_same(name, tmp_path):
     if used != name:
         pytest.skip(f"this processor has no {name}")
     points, transforms, weights = scene(count=500, angle=1.2)
-    mine = find_correspondences(points, transforms, weights, unit_grid(torch.float32), backend="native")
+    mine = find_correspondences(points, transforms, weights, unit_grid(torch.float32), search=SearchConfig(backend="native"))
     # A query on the verge of a fold may have a root in one and none in the other.
     counts = [torch.bincount(q, minlength=1000) for q in (mine.query, query)]
     same = counts[0] == counts[1]
@@ -244,7 +247,7 @@ def test_a_cell_that_the_pose_collapses_gives_no_infinite_inverse(search, backen
     transforms[0, 1, 0, 3] = -1.0
     points = torch.tensor([[[1.0, 0.7, 0.6], [0.4, 0.7, 0.6], [1.5, 0.2, 0.6]]], dtype=torch.float64)
     weights.requires_grad_()
-    found = find_correspondences(points, transforms, weights, grid, search=search, backend=backend)
+    found = find_correspondences(points, transforms, weights, grid, search=SearchConfig(search, backend=backend))
     assert found.jacobian_inverse.isfinite().all()
     assert found.found[0, 1:].all()
     (gradient,) = torch.autograd.grad(found.canonical.sum(), weights)

@@ -6,9 +6,10 @@ import pytest
 import torch
 from skinning_scenes import random_transforms, scene, smooth_weights, unit_grid
 
-from snarfcli.deformer import blend_transforms, find_correspondences
+from snarfcli.deformer import SearchConfig, blend_transforms, find_correspondences
 from snarfcli.deformer.blending import blend, blend_backward
 from snarfcli.deformer.ops import broyden_search, complete_search, implicit_backward, implicit_backward_reference
+from snarfcli.native import cpu
 
 SHAPE = (6, 7, 8)
 
@@ -50,7 +51,7 @@ def test_backward_against_its_reference():
     gradient = torch.randn(canonical.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     grid, shape = unit_grid(), SHAPE
     mine = implicit_backward(gradient, canonical, query, inverse, grid.lower, grid.upper, shape, 2, 40, True, True, "native")
-    theirs = implicit_backward_reference(gradient, canonical, query, inverse, grid, shape, 2, 40, (True, True))
+    theirs = implicit_backward_reference(gradient, canonical, query, inverse, grid.lower, grid.upper, shape, 2, 40, True, True)
     for a, b in zip(mine, theirs, strict=True):
         assert torch.allclose(a, b, rtol=1e-10, atol=1e-12)
 
@@ -115,6 +116,50 @@ def test_backward_operator_keeps_pytorchs_rules():
     )
 
 
+OTHER_DEVICES = ["MPS", "XPU", "HPU", "PrivateUse1"]
+
+
+@pytest.mark.parametrize("key", OTHER_DEVICES)
+@pytest.mark.parametrize("search", ["complete", "broyden"])
+def test_tensors_of_other_devices_run_the_reference(monkeypatch, search, key):
+    """The dispatcher hands them to the default kernel, which never reaches the CPU library."""
+    operator = {"complete": complete_search, "broyden": broyden_search}[search]
+    *arguments, _ = operator_arguments(search=search, count=6)
+    wanted = operator(*arguments, "reference")
+    _, transforms, weights = scene(torch.float64, count=6)
+    bones = transforms[:, :, :3].reshape(2, -1, 12)
+    gradient = (torch.ones_like(wanted[0]), *wanted[:3], unit_grid().lower, unit_grid().upper, list(SHAPE), 2, 6, True, True)
+    calls = [
+        (operator, arguments),
+        (implicit_backward, gradient),
+        (blend, (weights, bones, None)),
+        (blend_backward, (torch.ones(2, 336, 12, dtype=torch.float64), weights, bones, None, True, True)),
+    ]
+    results = [call(*given, "reference") for call, given in calls]
+
+    def fail():
+        raise AssertionError("the CPU library was called")
+
+    monkeypatch.setattr(cpu, "_library", fail)
+    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, key))
+    for (call, given), expected in zip(calls, results, strict=True):
+        assert not torch._C._dispatch_has_kernel_for_dispatch_key(call._qualname, key)
+        assert torch._C._dispatch_has_kernel_for_dispatch_key(call._qualname, "CPU")
+        found = call._opoverload.redispatch(keys, *given, "auto")
+        for mine, theirs in zip(*((x,) if isinstance(x, torch.Tensor) else x for x in (found, expected)), strict=True):
+            assert torch.equal(mine, theirs)
+    with pytest.raises(AssertionError, match="the CPU library was called"):
+        operator(*arguments, "auto")
+
+
+def test_meta_tensors_only_get_shapes():
+    *arguments, _, _ = operator_arguments(count=6)
+    meta = [value.to("meta") if isinstance(value, torch.Tensor) else value for value in arguments]
+    found = complete_search(*meta, 30, "native")
+    assert [list(part.shape) for part in found] == [[30, 3], [30], [30, 3, 3], [1]]
+    assert {part.device.type for part in found} == {"meta"}
+
+
 @pytest.mark.parametrize("capacity", [None, 300])
 @pytest.mark.parametrize("search", ["complete", "broyden"])
 def test_compiles_without_a_graph_break(search, capacity):
@@ -141,8 +186,10 @@ def test_capacity_pads_or_cuts(backend):
     points, transforms, weights = scene(torch.float64, count=30)
     grid = unit_grid()
     weights.requires_grad_()
-    free = find_correspondences(points, transforms, weights, grid, backend=backend)
-    roomy = find_correspondences(points, transforms, weights, grid, backend=backend, capacity=len(free.query) + 9)
+    free = find_correspondences(points, transforms, weights, grid, search=SearchConfig(backend=backend))
+    roomy = find_correspondences(
+        points, transforms, weights, grid, search=SearchConfig(backend=backend), capacity=len(free.query) + 9
+    )
     assert len(roomy.query) == len(free.query) + 9
     assert int(roomy.total) == len(free.query)
     assert torch.equal(roomy.canonical[:-9], free.canonical)
@@ -152,7 +199,7 @@ def test_capacity_pads_or_cuts(backend):
     assert torch.equal(roomy.maximum(roomy.canonical[:, 0], -9.0), free.maximum(free.canonical[:, 0], -9.0))
     gradients = [torch.autograd.grad(f.canonical.square().sum(), weights)[0] for f in (free, roomy)]
     assert torch.allclose(*gradients)
-    tight = find_correspondences(points, transforms, weights, grid, backend=backend, capacity=5)
+    tight = find_correspondences(points, transforms, weights, grid, search=SearchConfig(backend=backend), capacity=5)
     assert torch.equal(tight.canonical, free.canonical[:5])
     assert int(tight.total) == len(free.query)
 
@@ -163,7 +210,7 @@ def test_an_empty_batch_has_no_gradient_to_give(backend):
     weights.requires_grad_()
     for capacity in (None, 7):
         empty = torch.empty(0, 5, 3, dtype=torch.float64), torch.empty(0, 4, 4, 4, dtype=torch.float64, requires_grad=True)
-        found = find_correspondences(*empty, weights, unit_grid(), backend=backend, capacity=capacity)
+        found = find_correspondences(*empty, weights, unit_grid(), search=SearchConfig(backend=backend), capacity=capacity)
         assert int(found.total) == 0
         assert len(found.query) == (capacity or 0)
         (gradient,) = torch.autograd.grad(found.canonical.sum(), weights)
@@ -173,9 +220,11 @@ def test_an_empty_batch_has_no_gradient_to_give(backend):
 @pytest.mark.parametrize("backend", ["native", "reference"])
 def test_autocast_changes_nothing(backend):
     points, transforms, weights = scene()
-    plain = find_correspondences(points, transforms, weights, unit_grid(torch.float32), backend=backend)
+    plain = find_correspondences(points, transforms, weights, unit_grid(torch.float32), search=SearchConfig(backend=backend))
     with torch.autocast("cpu", torch.bfloat16):
-        mixed = find_correspondences(points, transforms, weights, unit_grid(torch.float32), backend=backend)
+        mixed = find_correspondences(
+            points, transforms, weights, unit_grid(torch.float32), search=SearchConfig(backend=backend)
+        )
     assert torch.equal(plain.query, mixed.query)
     assert torch.allclose(plain.canonical, mixed.canonical, atol=1e-6)
 
@@ -197,27 +246,30 @@ def test_the_largest_value_is_that_of_a_root_however_low():
 
 
 CASES = {
-    "nan transform": (lambda p, t, w: (p, t * torch.nan, w), {}, "bone_transforms must be finite"),
+    "nan transform": (lambda p, t, w: (p, t * torch.nan, w), {}, "bone_transforms: wanted finite numbers"),
     "singular transform": (lambda p, t, w: (p, torch.zeros_like(t), w), {}, "singular one for bone 0 of pose 0"),
-    "weights do not sum to 1": (lambda p, t, w: (p, t, w * 0.7), {}, "sum to 1 at every node .* got a sum of 0.7"),
-    "no weights": (lambda p, t, w: (p, t, w * 0), {}, "sum to 1 at every node .* got a sum of 0"),
-    "no bones": (lambda p, t, w: (p, t[:, :0], w[..., :0]), {}, r"skinning_weights must be \[D, H, W, J\]"),
-    "tolerance": (lambda p, t, w: (p, t, w), {"tolerance": -1e-6}, "tolerance must be greater than 0, got -1e-06"),
-    "no number": (lambda p, t, w: (p, t, w), {"tolerance": float("nan")}, "tolerance must be greater than 0, got nan"),
-    "steps": (lambda p, t, w: (p, t, w), {"max_steps": 0}, "max_steps must be greater than 0, got 0"),
-    "starts without need": (lambda p, t, w: (p, t, w), {"init_bones": [0]}, "init_bones needs search='broyden'"),
+    "weights do not sum to 1": (lambda p, t, w: (p, t, w * 0.7), {}, "a sum of 1 at every node .* got 0.7"),
+    "no weights": (lambda p, t, w: (p, t, w * 0), {}, "a sum of 1 at every node .* got 0"),
+    "no bones": (lambda p, t, w: (p, t[:, :0], w[..., :0]), {}, r"skinning_weights: wanted shape \[D, H, W, J\]"),
+    "tolerance": (lambda p, t, w: (p, t, w), {"tolerance": -1e-6}, "search.tolerance: wanted more than 0, got -1e-06"),
+    "no number": (lambda p, t, w: (p, t, w), {"tolerance": float("nan")}, "search.tolerance: wanted more than 0, got nan"),
+    "steps": (lambda p, t, w: (p, t, w), {"max_steps": 0}, "search.max_steps: wanted more than 0, got 0"),
+    "starts without need": (lambda p, t, w: (p, t, w), {"init_bones": [0]}, "search.init_bones needs search.name 'broyden'"),
     "cells without need": (
         lambda p, t, w: (p, t, w),
-        {"search": "broyden", "active_cells": torch.ones([n - 1 for n in SHAPE], dtype=torch.bool)},
-        "active_cells needs search='complete'",
+        {"name": "broyden", "active_cells": torch.ones([n - 1 for n in SHAPE], dtype=torch.bool)},
+        "active_cells needs search.name 'complete'",
     ),
-    "backend": (lambda p, t, w: (p, t, w), {"backend": "gpu"}, "backend must be 'auto', 'native' or 'reference', got 'gpu'"),
-    "capacity": (lambda p, t, w: (p, t, w), {"capacity": -1}, "capacity must be 0 or more, got -1"),
+    "backend": (lambda p, t, w: (p, t, w), {"backend": "gpu"}, "search.backend: wanted auto, native or reference, got 'gpu'"),
+    "capacity": (lambda p, t, w: (p, t, w), {"capacity": -1}, "capacity: wanted 0 or more, got -1"),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_wrong_values_are_named(case):
     change, settings, message = CASES[case]
+    others = {name: settings[name] for name in ("active_cells", "capacity") if name in settings}
+    search = SearchConfig(**{name: value for name, value in settings.items() if name not in others})
+    given = change(*scene())
     with pytest.raises(ValueError, match=message):
-        find_correspondences(*change(*scene()), unit_grid(torch.float32), **settings)
+        find_correspondences(*given, unit_grid(torch.float32), search=search, **others)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from skinning_scenes import exhaustive_roots, move, posed_queries, random_transforms, smooth_weights, unit_grid
 
-from snarfcli.deformer import find_correspondences
+from snarfcli.deformer import SearchConfig, find_correspondences
 
 SHAPE = (6, 7, 8)
 
@@ -25,7 +25,7 @@ def test_complete_search_finds_what_exhaustive_search_finds(bones, angle):
     grid, weights = unit_grid(), smooth_weights(SHAPE, bones)
     transforms = random_transforms(1, bones, angle)
     points, _ = posed_queries(weights, transforms[0], 40)
-    result = find_correspondences(points[None], transforms, weights, grid, max_steps=20)
+    result = find_correspondences(points[None], transforms, weights, grid, search=SearchConfig(max_steps=20))
     truth = exhaustive_roots(points, weights, transforms[0], grid)
     hits = total = 0
     for q, roots in enumerate(truth):
@@ -58,7 +58,7 @@ def test_every_root_solves_the_equation_and_its_jacobian_is_exact(search):
     grid, weights = unit_grid(), smooth_weights(SHAPE, 6)
     transforms = random_transforms(2, 6, 0.6)
     points = torch.stack([posed_queries(weights, pose, 200, 3)[0] for pose in transforms])
-    result = find_correspondences(points, transforms, weights, grid, search=search, tolerance=1e-7, max_steps=30)
+    result = find_correspondences(points, transforms, weights, grid, search=SearchConfig(search, tolerance=1e-7, max_steps=30))
     assert len(result.query) > 100
     for b in range(2):
         mine = result.pose == b
@@ -81,14 +81,16 @@ def test_broyden_roots_are_among_the_complete_ones():
     transforms = random_transforms(1, 6, 0.5)
     points, _ = posed_queries(weights, transforms[0], 300)
     complete = find_correspondences(points[None], transforms, weights, grid)
-    broyden = find_correspondences(points[None], transforms, weights, grid, search="broyden", tolerance=1e-6, max_steps=50)
+    broyden = find_correspondences(
+        points[None], transforms, weights, grid, search=SearchConfig("broyden", tolerance=1e-6, max_steps=50)
+    )
     known = [
         bool(((complete.canonical[complete.query == query] - root).norm(dim=1) < 1e-4).any())
         for root, query in zip(broyden.canonical, broyden.query, strict=True)
     ]
     assert len(known) > 250
     assert sum(known) >= 0.98 * len(known)  # the rest are second roots in a fold's cell
-    few = find_correspondences(points[None], transforms, weights, grid, search="broyden", init_bones=[0])
+    few = find_correspondences(points[None], transforms, weights, grid, search=SearchConfig("broyden", init_bones=[0]))
     assert len(few.query) < len(broyden.query)
 
 
@@ -183,20 +185,28 @@ def test_only_active_cells_are_searched():
 
 
 WRONG = {
-    "points": (lambda a: a | {"points": torch.zeros(4, 3)}, ValueError, r"points must have shape \[B, N, 3\], got \[4, 3\]"),
+    "points": (lambda a: a | {"points": torch.zeros(4, 3)}, ValueError, r"points: wanted shape \[B, N, 3\], got \[4, 3\]"),
     "bones": (
         lambda a: a | {"bone_transforms": torch.zeros(1, 2, 4, 4)},
         ValueError,
-        r"bone_transforms must have shape \[1, 3, 4, 4\] to fit the others, got \[1, 2, 4, 4\]",
+        r"bone_transforms: wanted shape \[1, 3, 4, 4\] to fit the others, got \[1, 2, 4, 4\]",
     ),
-    "weights": (lambda a: a | {"skinning_weights": torch.zeros(1, 4, 4, 3)}, ValueError, "skinning_weights must be"),
-    "integers": (lambda a: a | {"points": torch.zeros(1, 4, 3, dtype=torch.int64)}, TypeError, "points must be float32 or"),
-    "mixed": (lambda a: a | {"points": torch.zeros(1, 4, 3).double()}, TypeError, "must have the dtype of points"),
-    "search": (lambda a: a | {"search": "newton"}, ValueError, "search must be 'complete' or 'broyden', got 'newton'"),
-    "init": (lambda a: a | {"search": "broyden", "init_bones": [3]}, ValueError, r"init_bones must lie in 0..2, got \[3\]"),
-    "no init": (lambda a: a | {"search": "broyden", "init_bones": []}, ValueError, "at least one bone"),
-    "active": (lambda a: a | {"active_cells": torch.ones(3, 3, 3)}, ValueError, r"active_cells must be bool \[5, 6, 7\]"),
-    "jacobian": (lambda a: a | {"jacobian": "broyden"}, ValueError, "jacobian='broyden' needs search='broyden'"),
+    "weights": (lambda a: a | {"skinning_weights": torch.zeros(1, 4, 4, 3)}, ValueError, "skinning_weights: wanted shape"),
+    "integers": (lambda a: a | {"points": torch.zeros(1, 4, 3, dtype=torch.int64)}, TypeError, "points: wanted float32 or"),
+    "mixed": (lambda a: a | {"points": torch.zeros(1, 4, 3).double()}, TypeError, "wanted the dtype of points"),
+    "search": (lambda a: a | {"search": "newton"}, ValueError, "search.name: wanted complete or broyden, got 'newton'"),
+    "init": (
+        lambda a: a | {"search": SearchConfig("broyden", [3])},
+        ValueError,
+        r"search.init_bones: wanted bones from 0 to 2, got \[3\]",
+    ),
+    "no init": (lambda a: a | {"search": SearchConfig("broyden", [])}, ValueError, "at least one bone"),
+    "active": (lambda a: a | {"active_cells": torch.ones(3, 3, 3)}, ValueError, r"active_cells: wanted bool \[5, 6, 7\]"),
+    "jacobian": (
+        lambda a: a | {"search": SearchConfig(jacobian="broyden")},
+        ValueError,
+        "search.jacobian 'broyden' needs search.name 'broyden'",
+    ),
 }
 
 

@@ -69,8 +69,8 @@ def test_any_pose_counts():
     avatar = capsule_avatar()
     logits = avatar.model.canonical_logits
 
-    def swollen(canonical, condition, pose, precision="highest"):
-        return logits(canonical, condition, pose, precision) + 3.0 * condition[pose].abs().amax(1)
+    def swollen(canonical, condition, pose, *rest):
+        return logits(canonical, condition, pose, *rest) + 3.0 * condition[pose].abs().amax(1)
 
     avatar.model.canonical_logits = swollen
     poses = POSES.clone()

@@ -6,9 +6,10 @@ import pickle
 
 import pytest
 import torch
+from skinning_scenes import scene, unit_grid
 
 from snarfcli.avatar import Avatar
-from snarfcli.deformer import Correspondences
+from snarfcli.deformer import Correspondences, find_correspondences
 from snarfcli.errors import UserError
 from snarfcli.models.fast_snarf import blend
 from snarfcli.models.settings import ModelConfig
@@ -55,6 +56,23 @@ def test_blend_gives_every_correspondence_a_gradient():
         assert torch.autograd.gradcheck(lambda x, config=config: blend(x, found, config), logits)
         (gradient,) = torch.autograd.grad(blend(logits, found, config).sum(), logits)
         assert bool((gradient != 0).all())
+
+
+@pytest.mark.parametrize("kind", ["logit", "probability"])
+def test_rows_beyond_the_roots_change_nothing(kind):
+    """As a search with a capacity returns them: their query is B * N, and they get no gradient."""
+    points, transforms, weights = scene(torch.float64, count=30)
+    config = ModelConfig(blend=kind, blend_sharpness=5.0)
+    free = find_correspondences(points, transforms, weights, unit_grid())
+    padded = find_correspondences(points, transforms, weights, unit_grid(), capacity=len(free.query) + 9)
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn(len(free.query), dtype=torch.float64, generator=generator).requires_grad_()
+    more = torch.cat([logits.detach(), torch.full((9,), 1e4, dtype=torch.float64)]).requires_grad_()
+    wanted, found = blend(logits, free, config), blend(more, padded, config)
+    assert torch.equal(found, wanted)
+    (expected,), (gradient,) = (torch.autograd.grad(out.sin().sum(), x) for out, x in ((wanted, logits), (found, more)))
+    assert torch.equal(gradient[:-9], expected)
+    assert not gradient[-9:].any()
 
 
 class Bomb:

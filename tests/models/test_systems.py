@@ -255,6 +255,18 @@ def test_local_condition_shows_each_point_the_joints_that_move_it(store, name):
     assert not torch.allclose(wanted, model.shape(canonical, model.condition(POSES), pose), atol=1e-2)
 
 
+def test_the_weight_field_is_evaluated_once_per_step(store):
+    model = new_system(store, "fast_snarf", condition="local").model.train()
+    transforms, calls = torch.eye(4).expand(2, 2, 4, 4), []
+    model.deformer.field.register_forward_hook(lambda *_: calls.append(1))
+    found = model.find(torch.rand(2, 20, 3, generator=torch.Generator().manual_seed(0)), transforms, POSES)
+    model.shape_at(found, POSES)
+    points, owner = model.deformer.random_canonical(4, torch.Generator().manual_seed(0)), torch.tensor([0, 1, 0, 1])
+    handed_on = model.bone_logits(points, owner, transforms, POSES, found=found)
+    assert len(calls) == 1
+    torch.testing.assert_close(handed_on, model.bone_logits(points, owner, transforms, POSES))
+
+
 def test_points_of_bones_see_the_joints_of_their_bone(store):
     model = new_system(store, "back_lbs", condition="local").model
     model._joints_of_bones = torch.tensor([[0.0], [1.0]])

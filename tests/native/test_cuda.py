@@ -11,10 +11,10 @@ from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
 from ground_truth import true_roots
 from skinning_scenes import posed_queries, random_transforms, smooth_weights, unit_grid
 
-from snarfcli.deformer import CanonicalGrid, find_correspondences, ops
+from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences, ops
 from snarfcli.deformer.correspondences import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
-from snarfcli.native import cuda, cuda_compile, cuda_driver
+from snarfcli.native import cpu, cuda, cuda_compile, cuda_driver
 from snarfcli.native.library import native_library
 
 SHAPE = (6, 7, 8)
@@ -113,9 +113,9 @@ def test_constants_are_those_of_the_headers():
 
 def test_functions_take_what_the_operators_take():
     for name in ("complete_search", "broyden_search", "implicit_backward"):
-        mine = list(inspect.signature(getattr(cuda, name)).parameters)
         schema = getattr(ops, name)._opoverload._schema
-        assert [argument.name for argument in schema.arguments] == [*mine, "backend"]
+        for function in (getattr(cuda, name), getattr(cpu, name), getattr(ops, f"{name}_reference")):
+            assert [argument.name for argument in schema.arguments] == [*inspect.signature(function).parameters, "backend"]
 
 
 # ---------------------------------------------------------------- searching
@@ -131,7 +131,7 @@ def test_structures_match_the_kernels(emulated):
 def test_complete_search_equals_the_reference(runner, bones, angle, dtype):
     points, poses, weights, grid, transforms = scene(bones, angle, dtype, batch=3)
     found = runner.complete(points, transforms, grid, SHAPE)
-    wanted = find_correspondences(points, poses, weights, grid, backend="reference", max_steps=20)
+    wanted = find_correspondences(points, poses, weights, grid, search=SearchConfig(backend="reference", max_steps=20))
     assert int(found[3]) == len(found[1]) >= 600
     # float32: coordinates to 1.5 m, measured worst 2e-6 m and 2e-5. float64: the reference's nodes are rounded to float32.
     tolerance = (1e-5, 1e-3) if dtype == torch.float32 else (1e-9, 1e-5)
@@ -143,7 +143,7 @@ def test_complete_search_equals_the_reference(runner, bones, angle, dtype):
 def test_complete_search_equals_the_cpu_library(runner, dtype):
     points, poses, weights, grid, transforms = scene(24, 0.7, dtype, batch=3, count=1000)
     found = runner.complete(points, transforms, grid, SHAPE)
-    wanted = find_correspondences(points, poses, weights, grid, backend="native")
+    wanted = find_correspondences(points, poses, weights, grid, search=SearchConfig(backend="native"))
     assert len(found[1]) > 3500
     # Whether a root exists at all is a matter of rounding where it lies on a fold, to which J^-1 grows without bound.
     size = wanted.jacobian_inverse.flatten(1).norm(dim=1)
@@ -168,8 +168,8 @@ def test_complete_search_finds_every_root_beside_folds(runner, angle):
 @pytest.mark.parametrize("exact", [True, False])
 def test_broyden_search_equals_the_reference(runner, dtype, exact):
     points, poses, weights, grid, transforms = scene(6, 0.4, dtype, batch=3)
-    settings = {"search": "broyden", "init_bones": [0, 2, 5], "jacobian": "exact" if exact else "broyden"}
-    wanted = find_correspondences(points, poses, weights, grid, backend="reference", **settings)
+    search = SearchConfig("broyden", [0, 2, 5], "exact" if exact else "broyden", backend="reference")
+    wanted = find_correspondences(points, poses, weights, grid, search=search)
     starts = _start_transforms(poses, [0, 2, 5])
     found = runner.broyden(points, transforms, starts, grid, SHAPE, exact_jacobian=exact)
     assert int(found[3]) == len(found[1])
@@ -405,7 +405,7 @@ def test_gradient_equals_the_reference(runner, dtype, block):
     roots = (gradient, canonical, query, inverse)
     if runner.device == "emulated":
         runner.block = block
-    wanted = ops.implicit_backward_reference(*roots, grid, SHAPE, 3, 60, (True, True))
+    wanted = ops.implicit_backward_reference(*roots, grid.lower, grid.upper, SHAPE, 3, 60, True, True)
     found = runner(cuda.run_backward, *roots, grid.lower, grid.upper, SHAPE, 3, 60, True, True)
     for mine, theirs in zip(found, wanted, strict=True):
         rounding = 1e-5 if dtype == torch.float32 else 1e-13
@@ -466,7 +466,9 @@ def test_correspondences_and_their_gradients_are_those_of_the_cpu(search):
     results = []
     for device in ("cpu", "cuda"):
         given = [value.detach().to(device).requires_grad_() for value in (points, poses, weights)]
-        found = find_correspondences(*given, grid.to(given[0]), search=search, backend="native", tolerance=1e-9, max_steps=30)
+        found = find_correspondences(
+            *given, grid.to(given[0]), search=SearchConfig(search, backend="native", tolerance=1e-9, max_steps=30)
+        )
         (found.canonical**2).sum().backward()  # on a thread of its own, which has no CUDA context yet
         results.append([found.query.cpu(), found.canonical.detach().cpu(), *(value.grad.cpu() for value in given)])
     assert torch.equal(results[0][0], results[1][0])

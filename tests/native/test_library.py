@@ -10,7 +10,8 @@ import warnings
 
 import pytest
 
-from snarfcli.native import library
+from snarfcli.native import backend, library
+from snarfcli.native.backend import choose_backend
 
 
 @pytest.fixture
@@ -19,7 +20,7 @@ def fresh(monkeypatch):
 
     def forget():
         library._load.cache_clear()
-        library._warn_once.cache_clear()
+        backend._warn_once.cache_clear()
 
     forget()
     yield monkeypatch
@@ -41,7 +42,7 @@ def test_the_native_library_is_loaded_here():
     assert library.why_unavailable() is None
     assert library.library_path().is_file()
     assert library.instruction_set() in ("avx512", "avx2", "baseline")
-    assert library.choose_backend("auto") == library.choose_backend("native") == "native"
+    assert choose_backend("auto") == choose_backend("native") == "native"
     assert library.native_library() is library.native_library()
 
 
@@ -56,22 +57,31 @@ def test_importing_loads_nothing():
 
 def test_backend_names():
     with pytest.raises(ValueError, match="backend: wanted auto, native or reference, got 'fast'"):
-        library.choose_backend("fast")
+        choose_backend("fast")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert library.choose_backend("reference") == "reference"
+        assert choose_backend("reference") == "reference"
 
 
 def test_without_a_library_auto_warns_once_and_native_raises(no_library):
     with pytest.warns(RuntimeWarning, match=f"reference in PyTorch.*there is no .* in {no_library}") as caught:
-        assert library.choose_backend("auto") == "reference"
-        assert library.choose_backend("auto") == "reference"
+        chosen = [choose_backend("auto") for _ in range(2)]
+    assert chosen == ["reference", "reference"]
     assert len(caught) == 1
     assert caught[0].filename == __file__
     with pytest.raises(RuntimeError, match="backend native is not available: there is no"):
-        library.choose_backend("native")
+        choose_backend("native")
     assert library.native_library() is library.library_path() is library.instruction_set() is None
     assert library.build_note() == {}
+
+
+def test_a_device_without_kernels_is_named(fresh):
+    with pytest.warns(RuntimeWarning, match="reference in PyTorch.*there are no kernels for tensors on mps") as caught:
+        chosen = [choose_backend("auto", "mps") for _ in range(2)]
+    assert chosen == ["reference", "reference"]
+    assert len(caught) == 1
+    with pytest.raises(RuntimeError, match="backend native is not available: there are no kernels for tensors on xpu"):
+        choose_backend("native", "xpu")
 
 
 def test_the_reason_noted_by_the_build_is_told(no_library):

@@ -116,7 +116,7 @@ def test_learning_rate_warms_up_and_falls(store):
     assert rates[0] == pytest.approx(1e-3, rel=1e-2)
     assert max(rates) == rates[9]
     assert rates[100] == pytest.approx(0.05 * 1e-2)
-    assert all(a >= b for a, b in itertools.pairwise(rates))
+    assert all(a >= b for a, b in itertools.pairwise(rates[9:]))
 
 
 def test_gradient_of_the_whole_model(store):
@@ -187,5 +187,5 @@ def test_avatar_file_holds_all_that_is_needed(store, tmp_path):
     assert torch.equal(avatar.occupancy(points, pose), again.occupancy(points, pose))
     assert again.facts == avatar.facts
     assert torch.equal(again.model.deformer.active_cells, avatar.model.deformer.active_cells)
-    with pytest.raises(ValueError, match=r"pose must have shape \[B, 2, 3\], got \[1, 3, 3\]"):
+    with pytest.raises(ValueError, match=r"pose: wanted shape \[B, 2, 3\], got \[1, 3, 3\]"):
         again.occupancy(points, torch.zeros(1, 3, 3))

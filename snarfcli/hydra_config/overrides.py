@@ -1,4 +1,7 @@
-"""Overrides such as `training.steps=9`: checks against the dataclasses of a command, and quoting for Hydra's grammar."""
+"""Overrides such as `training.steps=9`: checks against the dataclasses of a command, and quoting for Hydra's grammar.
+
+Imports of Hydra stand inside functions: it takes a third of a second, which --help does not need.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The dataclasses of a command as Hydra's schemas, their descriptions, and the choices in conf/."""
+"""The dataclasses of a command as Hydra's schemas, their descriptions, and the choices in conf/.
+
+Imports of Hydra stand inside functions: it takes a third of a second, which --help does not need.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ def group_schemas(schema: type) -> dict[str, type]:
 
 def register_schemas(name: str, schema: type) -> None:
     """Put the dataclass of a command, and those of its fields, into Hydra's store as `schema/...`."""
-    from hydra.core.config_store import ConfigStore  # Hydra takes a third of a second, which --help does not need
+    from hydra.core.config_store import ConfigStore
 
     store = ConfigStore.instance()
     store.store(group="schema", name=name, node=schema)

@@ -1,4 +1,4 @@
-"""The experiments of the papers: which systems each compares, with which settings, on which data."""
+"""The experiments of the papers: their systems, settings and data."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ class Row:
     """One system of a table."""
 
     key: str
-    """Its name: of the row in `systems=`, and first part of the names of its runs. One key stands for one set of overrides."""
+    """Name in `systems=`, and first part of the names of its runs. One key always means the same overrides."""
     label: str
-    """What the table calls it."""
+    """Name in the table."""
     overrides: tuple[str, ...] = ()
-    """Settings of `snarf train` that make it."""
+    """Settings of `snarf train`."""
     light: tuple[str, ...] = ()
-    """Further settings with every preset but paper, for a system that would take hours where others take minutes."""
+    """Further settings with every preset except paper, for a system that would otherwise take hours instead of minutes."""
     paper: str | None = None
-    """Its name in `papers.yaml`, where the papers report it."""
+    """Name in `papers.yaml` if the papers report it."""
     inside_test: str = "winding"
-    """How the training samples are labelled; the evaluation's always by winding number."""
+    """Labels of the training samples; the evaluation samples are always labelled by winding number."""
 
     def settings(self, training: str) -> tuple[str, ...]:
-        """Return the settings of `snarf train` with one of its presets."""
+        """Return the settings of `snarf train` with one of its training presets."""
         return self.overrides if training == "paper" else (*self.overrides, *self.light)
 
 
@@ -34,49 +34,49 @@ class Experiment:
     """One table with its figures."""
 
     name: str
-    """What `snarf reproduce` calls it."""
+    """Name in `snarf reproduce`."""
     title: str
     """Heading of the report."""
     rows: tuple[Row, ...]
     """Systems, in the order of the table."""
     data: tuple[str, ...]
-    """Data sets that it can be made on; the first is the default."""
+    """Data sets that it can use; the first is the default."""
     subjects: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Subjects by data set, where none are named."""
+    """Default subjects by data set."""
     training: str = "quick"
-    """Training preset, where none is named."""
+    """Default training preset."""
     order: tuple[str, ...] = ()
-    """Keys of rows from the best to the worst out of distribution, as the papers have it."""
+    """Keys of rows from the best to the worst out of distribution, as the papers report."""
     notes: tuple[str, ...] = ()
-    """What a reader must know."""
+    """Notes for the reader of the report."""
 
 
 _DFAUST = ("50002", "50004", "50007", "50009", "50020", "50021", "50022", "50025", "50026", "50027")
 _BODIES = ("builtin", "dfaust")
 _BODY_SUBJECTS = {"builtin": ("50002", "50004"), "dfaust": _DFAUST}
 
-# The papers' systems see the whole pose, whatever the default of `condition` is.
+# The papers' systems use the whole pose, independent of the default of `condition`.
 _PAPERS = ("condition=global",)
 _BROYDEN = ("model=fast_snarf", "search=broyden", "search.jacobian=broyden", *_PAPERS)
 _OURS = ("model=fast_snarf", "search=complete")
 
 _POSE_ONET = Row("pose_onet", "Pose-ONet", ("model=pose_onet", *_PAPERS), paper="pose_onet")
 _BACK_D = Row("back_d", "Back-D", ("model=back_d", *_PAPERS), paper="back_d")
-# The papers' learns its weights from nothing; from the bones' distances, where our presets start, it is another system.
-_FROM_NOTHING = "skinning.prior_falloff_m=null"
-_BACK_LBS = Row("back_lbs", "Back-LBS", ("model=back_lbs", _FROM_NOTHING, *_PAPERS), paper="back_lbs")
+# In the papers its weights have no prior; our presets start from the distances to the bones, which makes another system.
+_NO_PRIOR = "skinning.prior_falloff_m=null"
+_BACK_LBS = Row("back_lbs", "Back-LBS", ("model=back_lbs", _NO_PRIOR, *_PAPERS), paper="back_lbs")
 _BACK_LBS_PRIOR = Row("back_lbs-prior", "Back-LBS, weights start from the bones", ("model=back_lbs", *_PAPERS))
 _NASA = Row("nasa", "NASA", ("model=nasa", *_PAPERS), paper="nasa")
-# A step of the presets takes it 12 s on a core, 150 times as long as Fast-SNARF; nine bones, which its released code starts
-# from too, and an eighth of the points make it 0.4 s.
+# A step of the presets takes 12 s on one core, 150 times as long as for Fast-SNARF. With nine start bones (as in the released
+# code) and an eighth of the points it takes 0.4 s.
 _SNARF_LIGHT = (
     "search=broyden", "training.poses_per_step=2", "training.uniform_points=150", "training.surface_points=450",
     "training.far_points=50",
 )  # fmt: skip
 _SNARF = Row("snarf", "SNARF", ("model=snarf", *_PAPERS), _SNARF_LIGHT, "snarf")
 _SNARF_NOTE = (
-    "With any preset but paper SNARF searches from nine bones and sees an eighth of the points in a step; the times of its "
-    "rows are for that."
+    "With all presets except paper, SNARF searches from nine bones and uses an eighth of the points per step; the times of "
+    "its rows are for these settings."
 )
 _FAST_SNARF = Row("fast_snarf-broyden", "Fast-SNARF", _BROYDEN, paper="fast_snarf")
 _GLOBAL = Row("ours-global", "ours, condition=global", (*_OURS, "condition=global"))
@@ -90,7 +90,7 @@ def _grid(key: str, resolution: tuple[int, int, int], paper: str) -> Row:
 
 
 def _changed(key: str, label: str, *overrides: str, inside_test: str = "winding") -> Row:
-    """Return a row that differs from `_GLOBAL` in one thing."""
+    """Return a row that differs from `_GLOBAL` in one setting."""
     return Row(key, label, (*_OURS, "condition=global", *overrides), inside_test=inside_test)
 
 
@@ -102,10 +102,10 @@ _TABLE1 = Experiment(
     _BODY_SUBJECTS,
     order=("ours-local", "ours-global", "fast_snarf-broyden", "snarf", "nasa", "back_lbs", "back_d", "pose_onet"),
     notes=(
-        "Fast-SNARF is the paper's search (nine bones, Broyden's Jacobian) with everything else as in ours.",
+        "Fast-SNARF uses the paper's search (nine bones, Broyden's Jacobian); everything else is as in ours.",
         _SNARF_NOTE,
-        "Back-LBS learns its weights from nothing, as in the papers; in the row below it they start from the distances to the "
-        "posed bones, as ours do from the canonical ones.",
+        "Back-LBS learns its weights without a prior, as in the papers; in the row below they start from the distances to the "
+        "posed bones, as ours start from the distances to the canonical bones.",
     ),
 )
 
@@ -136,7 +136,7 @@ _RECIPE = (
 
 _ABLATIONS = Experiment(
     "ablations",
-    "One thing changed at a time",
+    "Ablations: one change at a time",
     (
         Row("ours-global", "base: complete search, exact Jacobian, condition=global", _GLOBAL.overrides),
         Row("broyden9", "search from 9 bones, exact Jacobian",
@@ -157,14 +157,14 @@ _ABLATIONS = Experiment(
     _BODIES,
     _BODY_SUBJECTS,
     notes=(
-        "Every row differs from the base in what its label says, and in nothing else; the papers' recipe takes their search, "
-        "sampling, blend, learning rate and starting point at once.",
-        "All are evaluated on labels by winding number.",
+        "Every row differs from the base only in what its label says; the papers' recipe changes search, sampling, blend, "
+        "learning rate and initialisation together.",
+        "All rows are evaluated on labels by winding number.",
     ),
 )  # fmt: skip
 
 # S Sec. 4.3: "we do not use local pose-conditioning as the shape does not locally deform with pose". Pose-ONet and the weights
-# of Back-LBS depend on the pose all the same.
+# of Back-LBS depend on the pose nevertheless.
 _STICK2D = Experiment(
     "stick2d",
     "2D stick (SNARF Sec. 4.3, Fig. 4 and 5)",
@@ -179,8 +179,8 @@ _STICK2D = Experiment(
     training="stick2d",
     order=("ours-none", "back_lbs", "pose_onet"),
     notes=(
-        "stick: two bones; stick_object: a rigid object besides; stick_stepN: two bones, training angles N degrees apart.",
-        "In distribution: angles as in training, out of distribution: larger ones.",
+        "stick: two bones; stick_object: two bones, a rigid object; stick_stepN: two bones, training angles N degrees apart.",
+        "In distribution: angles as in training; out of distribution: larger angles.",
     ),
 )
 
@@ -194,7 +194,7 @@ _CLOTHED = Experiment(
     ),
     ("clothed", "cape"),
     {"clothed": ("50002", "50004")},
-    notes=("The papers show pictures of this experiment and no numbers.", _SNARF_NOTE),
+    notes=("The papers show pictures of this experiment, but no numbers.", _SNARF_NOTE),
 )
 
 EXPERIMENTS = {experiment.name: experiment for experiment in (_TABLE1, _TABLE2, _ABLATIONS, _STICK2D, _CLOTHED)}

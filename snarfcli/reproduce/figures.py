@@ -1,4 +1,7 @@
-"""The figures of a report: systems beside the truth, their skinning weights in colour, and curves."""
+"""The figures of a report: systems beside the ground truth, skinning weights in colour, and curves.
+
+Matplotlib is imported inside functions: it takes half a second, and most calls draw nothing.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,7 @@ from snarfcli.rendering import Camera, contact_sheet, render, write_png
 from snarfcli.reproduce.experiments import Row
 from snarfcli.reproduce.plans import Plan
 from snarfcli.reproduce.results import COLUMNS, Result, summarise
+from snarfcli.reproduce.stick2d_figures import draw_curves, draw_shapes, extreme_poses
 from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.samples.store import SampleStore
 
@@ -32,23 +36,23 @@ log = logging.getLogger(__name__)
 _PANEL = 256
 _FRAMES = {"id": 2, "ood": 4}
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*", "h", "<", ">", "d")
-# The subjects of the 2D stick: what is extrapolated, and the step of the training angles, degrees.
+# Subjects of the 2D stick: for extrapolation by setting, for interpolation by the step of the training angles in degrees.
 _STICKS = {"stick": "two bones", "stick_object": "two bones + object"}
 _STICK_STEPS = {"stick_step10": 10.0, "stick_step20": 20.0, "stick_step30": 30.0, "stick_step60": 60.0}
-_SEEN_FROM_RAD = 0.35  # a body in its canonical pose, nearly from the front
+_CANONICAL_AZIMUTH_RAD = 0.35  # nearly from the front
 
 
 def draw_systems(plan: Plan, results: Sequence[Result], folder: Path, resolution: int) -> tuple[Path, str] | None:
-    """Draw frames in and out of distribution, a row each: the truth, then what each system makes of it (S Fig. 6, F Fig. 5).
+    """Draw frames in and out of distribution, one row each: ground truth, then each system (SNARF Fig. 6, Fast-SNARF Fig. 5).
 
     Args:
-        plan: what was run.
-        results: its runs; of every system the first trained one is drawn, of the first subject that has any.
-        folder: for the picture.
+        plan: the plan.
+        results: its runs. All drawn runs are of the subject and seed for which most systems are trained.
+        folder: folder for the picture.
         resolution: voxels along the longest side of the meshes.
 
     Returns:
-        The file and its caption; None if there is nothing to draw.
+        File and caption; None if there is nothing to draw.
     """
     shown = _trained(plan, results)
     if not shown:
@@ -81,7 +85,7 @@ def draw_systems(plan: Plan, results: Sequence[Result], folder: Path, resolution
 
 
 def draw_weights(plan: Plan, results: Sequence[Result], folder: Path, resolution: int) -> tuple[Path, str] | None:
-    """Draw canonical surfaces coloured by their skinning weights, those that the data was made with first (F Fig. 6).
+    """Draw canonical surfaces coloured by their skinning weights; ground-truth weights first (Fast-SNARF Fig. 6).
 
     Arguments and result: as `draw_systems`. Systems without weights of canonical points are left out.
     """
@@ -93,10 +97,10 @@ def draw_weights(plan: Plan, results: Sequence[Result], folder: Path, resolution
     template = _store(shown[0][1], "id").template
     camera = None
     if template is not None:
-        camera = Camera.framing(template.vertices, azimuth_rad=_SEEN_FROM_RAD)
+        camera = Camera.framing(template.vertices, azimuth_rad=_CANONICAL_AZIMUTH_RAD)
         truth = Mesh(template.vertices, template.faces, colors=weights_to_colors(template.weights))
         pictures.append(render(truth, camera, _PANEL))
-        labels.append("the body's own")
+        labels.append("ground truth")
     for row, result in shown:
         avatar = _load(result)
         if avatar is None or not (avatar.has_skinning_weights and avatar.model.has_canonical_shape):
@@ -104,37 +108,38 @@ def draw_weights(plan: Plan, results: Sequence[Result], folder: Path, resolution
         try:
             mesh = canonical_surface(avatar, avatar.skeleton.canonical_pose.float(), resolution)
         except ValueError as error:
-            log.warning("warning: no weights to draw of %s: %s", row.label, error)
+            log.warning("warning: cannot draw the weights of %s: %s", row.label, error)
             continue
-        camera = camera or Camera.framing(mesh.vertices, azimuth_rad=_SEEN_FROM_RAD)
+        camera = camera or Camera.framing(mesh.vertices, azimuth_rad=_CANONICAL_AZIMUTH_RAD)
+        assert mesh.weights is not None  # the avatar has skinning weights
         pictures.append(render(replace(mesh, colors=weights_to_colors(mesh.weights)), camera, _PANEL))
         labels.append(row.label)
     if not pictures:
         return None
     path = folder / "weights.png"
     write_png(path, contact_sheet([pictures], column_labels=labels))
-    return path, f"Skinning weights, a colour for each bone, subject {shown[0][1].job.subject}, seed {shown[0][1].job.seed}"
+    return path, f"Skinning weights, one colour per bone, subject {shown[0][1].job.subject}, seed {shown[0][1].job.seed}"
 
 
 def draw_sequences(plan: Plan, results: Sequence[Result], folder: Path) -> tuple[Path, str] | None:
-    """Draw the surface IoU of every out-of-distribution sequence, the mean over runs, a line for each system.
+    """Draw the surface IoU of every out-of-distribution sequence, mean over runs, one line per system.
 
-    Arguments and result: as `draw_systems`. Only whole rows are drawn: the mean of some runs of another would mislead.
+    Arguments and result: as `draw_systems`. Rows with missing runs are left out, since a mean over fewer runs would mislead.
     """
     lines: dict[str, dict[str, float]] = {}
     for row in plan.experiment.rows:
         of_row = [result for result in results if result.job.row == row.key]
         if not of_row or not all("ood" in result.files for result in of_row):
             continue
-        values: dict[str, list[float]] = {}
+        by_name: dict[str, list[float]] = {}
         for result in of_row:
             for name, sequence in read_json(result.files["ood"], "metrics").get("sequences", {}).items():
-                values.setdefault(name, []).append(100 * sequence["iou_surface"])
-        lines[row.label] = {name: float(np.mean(some)) for name, some in values.items()}
+                by_name.setdefault(name, []).append(100 * sequence["iou_surface"])
+        lines[row.label] = {name: float(np.mean(some)) for name, some in by_name.items()}
     names = sorted({name for line in lines.values() for name in line})
     if len(names) < 2:
         return None
-    # from the easiest to the hardest, by the mean of all systems
+    # From the easiest to the hardest, by the mean of all systems.
     names.sort(key=lambda name: -np.mean([line[name] for line in lines.values() if name in line]))
     from matplotlib.figure import Figure
 
@@ -155,9 +160,10 @@ def draw_sequences(plan: Plan, results: Sequence[Result], folder: Path) -> tuple
 
 
 def draw_stick_shapes(plan: Plan, results: Sequence[Result], folder: Path) -> tuple[Path, str] | None:
-    """Draw the sticks out of distribution, the truth and each system (S Fig. 4). Arguments and result: as `draw_systems`."""
-    from snarfcli.reproduce.stick2d_figures import draw_shapes, extreme_poses
+    """Draw the sticks out of distribution: ground truth and each system (SNARF Fig. 4).
 
+    Arguments and result: as `draw_systems`.
+    """
     rows = []
     for subject in (one for one in _STICKS if one in plan.subjects):
         of_subject = [result for result in results if result.job.subject == subject and result.job.seed == plan.seeds[0]]
@@ -172,12 +178,10 @@ def draw_stick_shapes(plan: Plan, results: Sequence[Result], folder: Path) -> tu
 
 
 def draw_stick_curves(plan: Plan, results: Sequence[Result], folder: Path) -> tuple[Path, str] | None:
-    """Draw the IoU of the sticks out of distribution and by the step of training angles (S Fig. 5).
+    """Draw the IoU of the sticks out of distribution, and over the step of the training angles (SNARF Fig. 5).
 
-    Arguments and result: as `draw_systems`. A number that lacks one of its runs is drawn as none.
+    Arguments and result: as `draw_systems`. A number with missing runs is drawn as missing.
     """
-    from snarfcli.reproduce.stick2d_figures import draw_curves
-
     columns = {column.key: column for column in COLUMNS}
 
     def value(row: Row, subject: str, key: str) -> float | None:
@@ -196,7 +200,7 @@ def draw_stick_curves(plan: Plan, results: Sequence[Result], folder: Path) -> tu
 
 
 def _trained(plan: Plan, results: Sequence[Result]) -> list[tuple[Row, Result]]:
-    """Return rows and a trained run of each, all of the subject and seed that the most rows have."""
+    """Return rows with a trained run each, all of one subject and seed: those for which most rows are trained."""
     trained = [result for result in results if "train" in result.files]
     if not trained:
         return []
@@ -210,22 +214,22 @@ def _trained(plan: Plan, results: Sequence[Result]) -> list[tuple[Row, Result]]:
 
 
 def _load(result: Result) -> Avatar | None:
-    """Return a run's avatar; None, with a warning, if it cannot be read: its place in a figure stays empty."""
+    """Return the avatar of a run; None, with a warning, if it cannot be read. Its panel then stays empty."""
     try:
         return Avatar.load(result.job.folder)
     except UserError as error:
-        log.warning("warning: nothing to draw of %s: %s", result.job.name, error)
+        log.warning("warning: cannot draw %s: %s", result.job.name, error)
         return None
 
 
 def _store(result: Result, split: str) -> SampleStore:
-    """Return the samples that a split of a run is evaluated on."""
+    """Return the samples of a split on which a run is evaluated."""
     evaluation = next(one for one in result.job.evaluations if one.split == split)
     return SampleStore.open(evaluation.data_root, evaluation.data, result.job.subject)
 
 
 def _frames(result: Result, split: str, count: int) -> Iterator[tuple[SequenceSamples, int]]:
-    """Yield frames of a split, evenly spaced over its sequences; none if the data has no such split."""
+    """Yield frames of a split, evenly spaced over its sequences; no frame if the data set has no such split."""
     try:
         sequences = _store(result, split).sequences("test" if split == "id" else "ood")
     except UserError:
@@ -240,5 +244,5 @@ def _predicted(avatar: Avatar, sequence: SequenceSamples, index: int, resolution
     try:
         return field_surface(avatar, pose, translation, resolution, transforms=transforms)
     except ValueError as error:
-        log.warning("warning: no surface of %s, frame %d: %s", sequence.name, sequence.frame_numbers[index], error)
+        log.warning("warning: no surface for %s, frame %d: %s", sequence.name, sequence.frame_numbers[index], error)
         return None

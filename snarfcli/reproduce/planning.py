@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from snarfcli.checks import alternatives, check_choice
-from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.hydra_config.schema import group_options

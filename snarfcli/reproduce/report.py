@@ -1,4 +1,4 @@
-"""The report of an experiment: tables, figures, and how they came about, in a folder that can be kept on its own."""
+"""The report of an experiment: tables, figures and the files behind the numbers, in one self-contained folder."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import snarfcli
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, read_json, write_json
+from snarfcli.reproduce import figures
 from snarfcli.reproduce.papers import paper_source
 from snarfcli.reproduce.plans import Plan
 from snarfcli.reproduce.results import COLUMNS, Result
@@ -33,15 +34,15 @@ def write_report(
     about: str = "",
     figure_resolution: int | None = None,
 ) -> list[Path]:
-    """Write `<experiment>.md`, `<experiment>.csv`, `figures/` and `runs/`, the files behind the numbers, into a folder.
+    """Write `<experiment>.md`, `<experiment>.csv`, `figures/` and `runs/` (the files behind the numbers) into a folder.
 
     Args:
-        plan: what was run.
-        results: of all its jobs, in their order.
-        folder: the report's; links are relative to it, so that it may be moved.
-        command: that made it.
-        about: what else a reader must know of how it was run.
-        figure_resolution: voxels along the longest side of drawn meshes; None draws nothing.
+        plan: the plan.
+        results: results of all its jobs, in the same order.
+        folder: folder of the report; links are relative to it, so it can be moved.
+        command: the command line that made it.
+        about: further facts about how it was run.
+        figure_resolution: voxels along the longest side of drawn meshes; None draws no figures.
 
     Returns:
         The written tables and figures.
@@ -81,12 +82,12 @@ def _head(plan: Plan, results: Sequence[Result], command: str, about: str) -> st
         "",
         f"- made by snarf {snarfcli.__version__} on {_machines(results)}{f', {about}' if about else ''}",
         f"- data {plan.data}, subjects {', '.join(plan.subjects)}, seeds {', '.join(map(str, plan.seeds))}",
-        f"- training={plan.training}: {settings}{extra}; rows change of it what their runs' `config.yaml` says",
+        f"- training={plan.training}: {settings}{extra}; differences of single rows are in the `config.yaml` of their runs",
     ]
     lines += [f"- {note}" for note in experiment.notes]
     source = paper_source(experiment.name)
     if source and plan.data != "dfaust":
-        lines.append(f"- the papers' numbers ({source}) are of DFaust, PosePrior and a GPU: compare the order, not values")
+        lines.append(f"- the papers' numbers ({source}) are for DFaust, PosePrior and a GPU; compare the order, not the values")
     elif source:
         lines.append(f"- the papers' numbers: {source}, ten subjects, one Quadro RTX 6000")
     lines += ["", "Columns:", ""]
@@ -95,13 +96,13 @@ def _head(plan: Plan, results: Sequence[Result], command: str, about: str) -> st
     lines += [
         "",
         f"Numbers are means over the seeds of each subject, then over subjects{spread}. Where a run failed, the cell "
-        "says so, and of how many runs its number is; – stands where there is nothing to measure.",
+        "says so, with the number of runs that its value is from; – means that there is nothing to measure.",
     ]
     return "\n".join(lines)
 
 
 def _tables(plan: Plan, results: Sequence[Result], link: Any) -> str:
-    """Return the tables, the comparison of neighbours, and the list of what went wrong."""
+    """Return the tables, the comparison with the order of the papers, and the list of unfinished runs."""
     sections = []
     several = len(plan.subjects) > 1
     title = "## Mean over subjects" if several else f"## Subject {plan.subjects[0]}"
@@ -109,7 +110,7 @@ def _tables(plan: Plan, results: Sequence[Result], link: Any) -> str:
     order = order_lines(plan, results)
     if order:
         listed = "\n".join(f"- {line}" for line in order)
-        sections.append(f"Surface IoU out of distribution, in the order that the papers lead one to expect:\n\n{listed}")
+        sections.append(f"Surface IoU out of distribution, in the order reported by the papers:\n\n{listed}")
     more = more_columns(results)
     if more:
         sections.append(f"## More measures\n\n{markdown_table(plan, results, link, more)}")
@@ -123,9 +124,7 @@ def _tables(plan: Plan, results: Sequence[Result], link: Any) -> str:
 
 
 def _figures(plan: Plan, results: Sequence[Result], folder: Path, resolution: int) -> list[tuple[Path, str]]:
-    """Draw what belongs to the experiment; a figure that cannot be drawn is left out with a warning."""
-    from snarfcli.reproduce import figures
-
+    """Draw the figures of the experiment; a figure that cannot be drawn is left out with a warning."""
     if plan.experiment.name == "stick2d":
         wanted = [
             ("shapes", partial(figures.draw_stick_shapes, plan, results, folder)),
@@ -140,7 +139,7 @@ def _figures(plan: Plan, results: Sequence[Result], folder: Path, resolution: in
         try:
             made = make()
         except (UserError, ValueError, OSError) as error:
-            log.warning("warning: no figure of %s: %s", name, error)
+            log.warning("warning: cannot draw the figure %s: %s", name, error)
             continue
         if made is not None:
             drawn.append(made)
@@ -157,7 +156,7 @@ def _figures_text(figures: Sequence[tuple[Path, str]], folder: Path) -> str:
 
 
 def _copy(result: Result, folder: Path) -> dict[str, str]:
-    """Copy the files of a run into the report; return where they are, relative to it; without the numbers of single frames."""
+    """Copy the files of a run into the report, without the numbers of single frames; return their relative paths."""
     links = {}
     for stage, path in result.files.items():
         relative = Path("runs") / result.job.subject / Path(result.job.folder).name / _COPIES[stage]
@@ -170,20 +169,20 @@ def _copy(result: Result, folder: Path) -> dict[str, str]:
 
 
 def _machines(results: Sequence[Result]) -> str:
-    """Return the machines that the runs were made on, with PyTorch's version."""
+    """Return the machines of the runs, with the version of PyTorch."""
     names = {}
     for result in results:
         if "train" in result.files:
             content = read_json(result.files["train"], "metrics")
             machine, versions = content.get("machine", {}), content.get("versions", {})
-            parts = [machine.get("processor"), f"{machine.get('cores')} cores", f"{machine.get('threads')} threads a run"]
+            parts = [machine.get("processor"), f"{machine.get('cores')} cores", f"{machine.get('threads')} threads per run"]
             parts += [machine.get("gpu"), f"{machine.get('system')}, PyTorch {versions.get('torch')}"]
             names[", ".join(str(part) for part in parts if part)] = None
     return " and ".join(names) or "no machine yet"
 
 
 def _plain(value: Any) -> str:
-    """Return a setting as one writes it."""
+    """Return a value as it is written on the command line."""
     if value is None:
         return "null"
     if isinstance(value, bool):

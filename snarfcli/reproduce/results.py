@@ -1,4 +1,4 @@
-"""What the runs of a plan measured: their files, and the numbers of the table's columns."""
+"""The results of runs: their files, and the numbers of the columns of a table."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ __all__ = ["COLUMNS", "MORE_COLUMNS", "Cell", "Column", "Result", "collect", "su
 
 @dataclass(frozen=True)
 class Column:
-    """A number that every run has."""
+    """A column of a table: one number per run."""
 
     key: str
-    """Its name in the CSV and in `papers.yaml`."""
+    """Name in the CSV file and in `papers.yaml`."""
     title: str
-    """Its heading."""
+    """Heading."""
     meaning: str
-    """What it is."""
+    """Explanation in the report."""
     stage: str
-    """Which file has it: train, id or ood."""
+    """File with the number: train, id or ood."""
     path: tuple[str, ...]
-    """Where in the file."""
+    """Keys that lead to it in the file."""
     scale: float = 1.0
-    """From the file's unit to the table's."""
+    """Factor from the unit of the file to the unit of the table."""
     digits: int = 1
     """Decimals in the table."""
 
 
-_TIMES = "time for 200,000 points, milliseconds, scaled from frames of fewer, on the machine named above"
+_TIMES = "time for 200,000 points, milliseconds, scaled from smaller frames, on the machine named above"
 COLUMNS = (
     Column("bbox_id", "bbox in", "IoU of uniform points in the papers' box, held-out motion, %", "id", ("iou_bbox",), 100),
     Column("surface_id", "surface in", "IoU of points near the surface, held-out motion, %", "id", ("iou_surface",), 100),
@@ -46,10 +46,10 @@ COLUMNS = (
            ("iou_surface",), 100),
     Column("worst_ood", "worst frame out", "lowest surface IoU of a frame out of distribution, %", "ood",
            ("worst_iou_surface",), 100),
-    Column("search_ms", "search ms", f"going back to the canonical frame: {_TIMES}", "id", ("timings", "search_ms_per_200k")),
+    Column("search_ms", "search ms", f"mapping to the canonical frame: {_TIMES}", "id", ("timings", "search_ms_per_200k")),
     Column("shape_ms", "shape ms", f"the network: {_TIMES}", "id", ("timings", "shape_ms_per_200k")),
-    Column("total_ms", "total ms", f"everything: {_TIMES}", "id", ("timings", "total_ms_per_200k")),
-    Column("training_min", "training min", "steps times the time of a step, without validation, minutes", "train", ()),
+    Column("total_ms", "total ms", f"total: {_TIMES}", "id", ("timings", "total_ms_per_200k")),
+    Column("training_min", "training min", "number of steps times the time per step, without validation, minutes", "train", ()),
 )  # fmt: skip
 """The columns of every table."""
 
@@ -59,7 +59,7 @@ _BY_SPLIT = (
     ("normals", "normals", "mean cosine between the normals of both surfaces", ("surfaces", "normal_consistency"), 1, 3),
     ("f_score", "F 5 mm", "F-score at 5 mm of the extracted surface, %", ("surfaces", "f_score"), 100, 1),
     ("lost", "lost %", "inside points without a correspondence, %", ("inside_without_correspondence",), 100, 2),
-    ("roots", "roots", "correspondences of a point that has any", ("correspondences_per_point",), 1, 2),
+    ("roots", "roots", "mean number of correspondences of points with at least one", ("correspondences_per_point",), 1, 2),
 )  # fmt: skip
 MORE_COLUMNS = (
     *(
@@ -72,26 +72,26 @@ MORE_COLUMNS = (
     Column("right_bone", "right bone %", "vertices whose heaviest bone is the same as in the body model, %", "id",
            ("weights", "right_bone"), 100),
 )  # fmt: skip
-"""Columns of the second table; those that no run has are left out."""
+"""Columns of the second table; columns without a number are left out."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """One run: its numbers, or why there are none."""
+    """One run: its numbers, or why it has none."""
 
     job: Job
     """The run."""
     state: str
     """done, failed, diverged, stopped or missing."""
     reason: str = ""
-    """Why it is not done."""
+    """Reason if it is not done."""
     values: dict[str, float] = field(default_factory=dict)
-    """Numbers by column, in the units of the columns."""
+    """Numbers by column key, in the units of the columns."""
     files: dict[str, Path] = field(default_factory=dict)
-    """Files that the numbers are from: train, id, ood."""
+    """Files of the numbers, by stage: train, id, ood."""
 
     def unknown(self, column: Column) -> str | None:
-        """Return why there is no number: failed, diverged, missing, or `none` where the data has nothing to measure."""
+        """Return why there is no number: failed, diverged, missing, or `none` if there is nothing to measure."""
         if column.key in self.values:
             return None
         if self.state == "done" or column.stage in self.files:
@@ -101,21 +101,21 @@ class Result:
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of a table, of one run or of several."""
+    """One number of a table, from one or several runs."""
 
     mean: float | None
-    """Mean of the runs that have it: over the seeds of each subject, then over subjects."""
+    """Mean over the seeds of each subject, then over subjects, of the runs that have the number."""
     deviation: float | None
-    """Standard deviation over seeds of the mean over subjects; None with one seed, or where a run has no number."""
+    """Standard deviation over seeds of the mean over subjects; None with one seed, or if a run has no number."""
     runs: int
-    """How many runs it should be of."""
+    """Number of runs it should be from."""
     count: int
-    """How many have it."""
+    """Number of runs that have it."""
     unknown: dict[str, int]
-    """Why the others have not: how many failed, diverged or are missing."""
+    """Number of runs without it, by reason: failed, diverged, missing, none."""
 
     def text(self, digits: int) -> str:
-        """Return what the table says; never a plain mean of only some of the runs."""
+        """Return the text in the table. A mean of only some of the runs is always marked as such."""
         others = ", ".join(f"{count} {why}" for why, count in sorted(self.unknown.items()) if why != "none")
         if self.mean is None:
             if not others:
@@ -126,17 +126,16 @@ class Cell:
 
 
 def collect(job: Job) -> Result:
-    """Read what a run measured.
+    """Read the numbers of a run.
 
-    A file counts only if it belongs to the settings of the job: the avatar was trained with them, and an evaluation is newer
-    than the avatar.
+    Only files of the settings of the job are read: the avatar was trained with them, and the evaluation is newer than it.
     """
     folder = Path(job.folder)
     status = read_status(folder)
     if status is None:
         return Result(job, "missing", "not run yet")
     if status.digest != job.digest:
-        return Result(job, "missing", f"{folder} holds a run with other settings")
+        return Result(job, "missing", f"{folder} has a run with other settings")
     values: dict[str, float] = {}
     files: dict[str, Path] = {}
     if status.trained and (folder / "avatar.pt").is_file() and (folder / "metrics.json").is_file():
@@ -154,7 +153,7 @@ def collect(job: Job) -> Result:
 
 
 def summarise(results: Sequence[Result], column: Column) -> Cell:
-    """Return the number of a table for some runs: a row's, or those of one row and subject."""
+    """Return the number of a table for several runs, such as those of one row, or of one row and subject."""
     unknown: dict[str, int] = {}
     by_subject: dict[str, list[float]] = {}
     by_seed: dict[int, list[float]] = {}
@@ -179,7 +178,7 @@ def _state(status: JobStatus, job: Job, files: dict[str, Path]) -> tuple[str, st
     if status.state in ("failed", "diverged"):
         return status.state, f"{status.stage}: {status.reason}"
     if status.state == "done" and "train" not in files:
-        return "missing", f"{job.folder} has lost its avatar"
+        return "missing", f"{job.folder} has no avatar any more"
     if status.state == "done":
         return "done", ""
     return "stopped", f"interrupted at {status.stage or 'the start'}"
@@ -200,6 +199,6 @@ def _look_up(content: Any, path: Sequence[str]) -> float | None:
 
 
 def _training_min(content: dict[str, Any]) -> float | None:
-    """Return the time of the whole training, also of one that was interrupted, whose file times its last part alone."""
+    """Return the time of the whole training. (The file of a resumed training has the wall time of its last part only.)"""
     step_s, steps = _look_up(content, ("timings", "seconds_per_step")), _look_up(content, ("steps",))
     return None if step_s is None or steps is None else step_s * steps / 60

@@ -1,4 +1,7 @@
-"""The two figures of the 2D stick: shapes in extreme poses (SNARF Fig. 4), and IoU by setting and by step (SNARF Fig. 5)."""
+"""The two figures of the 2D stick: shapes in extreme poses (SNARF Fig. 4), and IoU by setting and by step (SNARF Fig. 5).
+
+Matplotlib is imported inside functions: it takes half a second, and most calls draw nothing.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from snarfcli.bodies import Skeleton
 from snarfcli.evaluation.evaluate import predict_inside
@@ -23,16 +27,16 @@ if TYPE_CHECKING:
 
 __all__ = ["StickPose", "draw_curves", "draw_shapes", "extreme_poses"]
 
-# Okabe and Ito's colours, which people who see fewer colours can tell apart; marks and hatches do so in print.
+# The colours of Okabe and Ito, distinct also for colour-blind readers; the marks are distinct in print.
 _COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442")
 _MARKS = ("o", "s", "^", "D", "v", "P", "X")
 _TRUTH_COLOR, _TRUTH_LINE, _BONE_COLOR = "#B8B8B8", "#D55E00", "black"
 _FILL, _LINE = "#9FCBE6", "#0072B2"
 _PANEL_INCHES = 1.9
 _DPI = 160
-_SURE = 2.0  # logits are cut off here before they are contoured: beyond, they say nothing about where zero is
+_LOGIT_LIMIT = 2.0  # logits are clipped before contouring; larger ones do not change the zero level
 _OUTLINE_WIDTH = 1.0
-_SPACE = 1.16  # side of a panel to the longest side of a shape
+_SPACE = 1.16  # side of a panel, relative to the longest side of a shape
 _NO_RESULT = "no result"
 
 
@@ -41,27 +45,27 @@ class StickPose:
     """One row of `draw_shapes`."""
 
     label: str
-    """What the row shows, such as the name of the subject."""
+    """Name of the row, such as the subject."""
     skeleton: Skeleton
-    """The subject's."""
+    """Skeleton of the subject."""
     sequence: SequenceSamples
     """Samples of a planar subject."""
     frame: int
-    """Which of the sequence's frames."""
+    """Index of the frame in the sequence."""
     avatars: Mapping[str, TrainedField | None]
-    """The subject's avatar of each system by its label; None, or left out: there is none."""
+    """Avatar of the subject by the label of the system; None or left out without an avatar."""
 
 
 def extreme_poses(
     store: SampleStore, label: str, avatars: Mapping[str, TrainedField | None], count: int = 2
 ) -> list[StickPose]:
-    """Choose rows for `draw_shapes`, out of distribution: of each stretch of frames the one in which most overlaps.
+    """Choose out-of-distribution poses for `draw_shapes`: from each part of the frames the one with the largest overlap.
 
     Args:
         store: samples of a planar subject with an out-of-distribution sequence.
-        label: what to call it.
-        avatars: of this subject, by the label of the system.
-        count: how many rows.
+        label: name of the rows.
+        avatars: avatars of this subject, by the label of the system.
+        count: number of poses.
 
     Raises:
         UserError: the store has no out-of-distribution sequence.
@@ -69,21 +73,21 @@ def extreme_poses(
     frames = [(sequence, index) for sequence in store.sequences("ood") for index in range(sequence.num_frames)]
     rows = []
     for stretch in np.array_split(np.arange(len(frames)), min(count, len(frames))):
-        # where nothing overlaps, the first of the stretch
+        # Without overlap this is the first frame of the part.
         sequence, index = max((frames[number] for number in stretch), key=lambda frame: _overlap(*frame))
         rows.append(StickPose(label, store.skeleton, sequence, index, avatars))
     return rows
 
 
 def draw_shapes(path: str | Path, rows: Sequence[StickPose], *, resolution: int = 300) -> None:
-    """Write a picture: a row for each pose, with the true shape and then that of each system; under each of these its IoU.
+    """Write a picture with one row per pose: the ground truth, then each system with its IoU below.
 
-    The IoU is that of the frame's uniform samples, as `snarf eval` measures it. Orange is the true outline, black the bones.
+    The IoU is that of the uniform samples of the frame, as in `snarf eval`. The true outline is orange, bones are black.
 
     Args:
-        path: of the picture; its suffix says the format (png, svg, pdf). Written whole or not at all.
-        rows: poses; the systems are those of all rows, in the order in which they come first.
-        resolution: lattice points along a side of a panel.
+        path: the picture; the suffix gives the format (png, svg, pdf). Written complete or not at all.
+        rows: poses; the systems are those of all rows, in order of first appearance.
+        resolution: lattice points along each side of a panel.
 
     Raises:
         ValueError: there are no rows.
@@ -100,17 +104,18 @@ def draw_shapes(path: str | Path, rows: Sequence[StickPose], *, resolution: int 
         lattice, x, y = _lattice(row, half, resolution)
         truth = np.where(_true_inside(row, lattice), 1.0, -1.0).reshape(resolution, resolution)
         for axis, name in zip(line, [None, *systems], strict=True):
+            avatar = None if name is None else row.avatars.get(name)
             axis.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal", xticks=[], yticks=[])
             for side in axis.spines.values():
                 side.set_visible(False)
             if name is None:
                 axis.contourf(x, y, truth, [0, 2], colors=[_TRUTH_COLOR])
                 axis.contour(x, y, truth, [0], colors=["#666666"], linewidths=_OUTLINE_WIDTH)
-            elif row.avatars.get(name) is None:
+            elif avatar is None:
                 axis.text(0.5, 0.5, _NO_RESULT, transform=axis.transAxes, ha="center", va="center", color="#666666")
                 continue
             else:
-                _draw_prediction(axis, row, row.avatars[name], lattice, x, y)
+                _draw_prediction(axis, row, avatar, lattice, x, y)
                 axis.contour(x, y, truth, [0], colors=[_TRUTH_LINE], linewidths=_OUTLINE_WIDTH, linestyles="dashed")
             _draw_bones(axis, row)
         angles = np.rad2deg(row.sequence.poses[row.frame, 1:3, 2])
@@ -128,9 +133,9 @@ def draw_curves(
     """Write a picture: on the left bars of the IoU out of distribution, on the right the IoU over the step of training angles.
 
     Args:
-        path: of the picture; its suffix says the format (png, svg, pdf). Written whole or not at all.
+        path: the picture; the suffix gives the format (png, svg, pdf). Written complete or not at all.
         extrapolation: for each system, by its label, the IoU (0 to 1) in each setting, such as "two bones" and "two bones +
-            object". None for a run that failed: written where its bar would be.
+            object". None for a failed run, which a text marks in place of the bar.
         interpolation: for each system the steps, degrees, and the IoU (0 to 1) at each; None leaves a gap in the curve.
 
     Raises:
@@ -171,16 +176,15 @@ def draw_curves(
 
 
 def _draw_bar(axis: Axes, centre: float, width: float, value: float | None, color: str) -> None:
-    """Draw a bar with its value in per cent above it, or say that there is none."""
-    missing = value is None or not np.isfinite(value)
-    height = 0.0 if missing else 100 * value
-    axis.bar(centre, height, 0.94 * width, color=color)
-    text = _NO_RESULT if missing else f"{height:.1f}"
-    axis.text(centre, height + 1.2, text, ha="center", va="bottom", fontsize=8, rotation=90 if missing else 0)
+    """Draw a bar with its value in per cent above it, or the text "no result"."""
+    height = 100 * value if value is not None and np.isfinite(value) else None
+    axis.bar(centre, height or 0.0, 0.94 * width, color=color)
+    text, rotation = (_NO_RESULT, 90) if height is None else (f"{height:.1f}", 0)
+    axis.text(centre, (height or 0.0) + 1.2, text, ha="center", va="bottom", fontsize=8, rotation=rotation)
 
 
 def _figure(height: int, width: int) -> tuple[Any, np.ndarray]:
-    """Return a figure of panels and its axes [height, width]."""
+    """Return a figure with panels, and its axes [height, width]."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(_PANEL_INCHES * width + 0.4, (_PANEL_INCHES + 0.25) * height + 0.3), layout="constrained")
@@ -198,7 +202,7 @@ def _wrapped(name: str) -> str:
 
 
 def _lattice(row: StickPose, half: float, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lattice points [R * R, 3], metres, of a square of the plane around a pose, and their x [R] and y [R]."""
+    """Return the lattice points [R * R, 3] of a square around a pose, with their x [R] and y [R], metres."""
     lower, upper = row.sequence.box(row.frame)
     centre = (lower + upper) / 2
     x, y = (np.linspace(centre[axis] - half, centre[axis] + half, resolution) for axis in (0, 1))
@@ -207,13 +211,13 @@ def _lattice(row: StickPose, half: float, resolution: int) -> tuple[np.ndarray, 
 
 
 def _true_inside(row: StickPose, points: np.ndarray) -> np.ndarray:
-    """Return which points [N, 3] of the plane are inside, as they are labelled in the samples, bool [N]."""
+    """Return which points [N, 3] of the plane are inside, labelled as in the samples, bool [N]."""
     vertices, faces = row.sequence.vertices(row.frame), row.sequence.faces(row.frame)
     return (winding_numbers(vertices, faces, points) > 0.5) | in_turned_over(vertices, faces, points)
 
 
 def _overlap(sequence: SequenceSamples, index: int) -> int:
-    """Return how many uniform points lie where parts overlap."""
+    """Return the number of uniform points in overlapping parts."""
     points = sequence.points(index, np.arange(sequence.num_uniform))
     return int((winding_numbers(sequence.vertices(index), sequence.faces(index), points) > 1.5).sum())
 
@@ -221,15 +225,13 @@ def _overlap(sequence: SequenceSamples, index: int) -> int:
 def _draw_prediction(
     axis: Axes, row: StickPose, avatar: TrainedField, lattice: np.ndarray, x: np.ndarray, y: np.ndarray
 ) -> None:
-    """Fill what an avatar calls inside, and write the frame's IoU below."""
-    import torch
-
+    """Fill the inside of an avatar, and write the IoU of the frame below."""
     posed = (row.sequence.bone_transforms, row.sequence.poses)
     transforms, pose = (torch.as_tensor(values[row.frame])[None] for values in posed)
     logits = avatar.query(torch.as_tensor(lattice)[None], transforms, pose).logits[0].detach().cpu().numpy()
-    values = logits.clip(-_SURE, _SURE).reshape(len(y), len(x))
+    values = logits.clip(-_LOGIT_LIMIT, _LOGIT_LIMIT).reshape(len(y), len(x))
     if values.max() > 0:
-        axis.contourf(x, y, values, [0, _SURE + 1], colors=[_FILL])
+        axis.contourf(x, y, values, [0, _LOGIT_LIMIT + 1], colors=[_FILL])
         axis.contour(x, y, values, [0], colors=[_LINE], linewidths=_OUTLINE_WIDTH)
     uniform = np.arange(row.sequence.num_uniform)
     inside = predict_inside(avatar, row.sequence, row.frame, row.sequence.points(row.frame, uniform))

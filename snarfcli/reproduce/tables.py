@@ -1,4 +1,4 @@
-"""The tables: Markdown to read, CSV to compute with."""
+"""The tables of a report, as Markdown and as CSV."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from snarfcli.reproduce.results import COLUMNS, MORE_COLUMNS, Cell, Column, Resu
 __all__ = ["csv_table", "markdown_runs", "markdown_table", "more_columns", "order_lines", "plain_table"]
 
 Link = Callable[[Result, str], str | None]
-"""Where the file of a stage (train, id, ood) of a run lies, relative to the report; None if there is none."""
+"""Returns the file of a stage (train, id, ood) of a run, relative to the report; None without a file."""
 
 
 def markdown_table(
     plan: Plan, results: Sequence[Result], link: Link, columns: Sequence[Column] = COLUMNS, subject: str | None = None
 ) -> str:
-    """Return a table with a line for each system, and one below it with what the paper says where it says something.
+    """Return a table with one line per system, followed by the numbers of the paper if it has any.
 
     Args:
-        plan: what was run.
-        results: of all its jobs.
-        link: gives each number of one run the file that it is from; a mean links to the list of its runs.
-        columns: which numbers.
-        subject: only this one; None for the mean over all.
+        plan: the plan.
+        results: results of all its jobs.
+        link: returns the file behind a number of one run; a mean links to the list of its runs.
+        columns: columns of the table.
+        subject: a subject, or None for the mean over all.
     """
     lines = ["| system | " + " | ".join(column.title for column in columns) + " |", "|---|" + "---|" * len(columns)]
     for row in plan.experiment.rows:
@@ -43,7 +43,7 @@ def markdown_table(
 
 
 def markdown_runs(plan: Plan, results: Sequence[Result], link: Link, columns: Sequence[Column] = COLUMNS) -> str:
-    """Return a table with a line for each run; every number links to the file that it is from."""
+    """Return a table with one line per run; every number links to its file."""
     lines = ["| run | state | " + " | ".join(column.title for column in columns) + " |", "|---|---|" + "---|" * len(columns)]
     for row in plan.experiment.rows:
         for number, result in enumerate(_of(results, row, None)):
@@ -55,9 +55,9 @@ def markdown_runs(plan: Plan, results: Sequence[Result], link: Link, columns: Se
 
 
 def plain_table(plan: Plan, results: Sequence[Result]) -> str:
-    """Return the main table for a terminal, without the times of its parts; the papers' numbers in brackets.
+    """Return the main table for a terminal, without the times of single parts; the papers' numbers in brackets.
 
-    With one subject these are its own, where the paper has them, else the means.
+    With one subject, the paper's numbers are those of the subject if it reports them, and the means otherwise.
     """
     subject = plan.subjects[0] if len(plan.subjects) == 1 else None
     columns = [column for column in COLUMNS if column.key not in ("search_ms", "shape_ms", "total_ms")]
@@ -76,15 +76,15 @@ def plain_table(plan: Plan, results: Sequence[Result]) -> str:
         for line in rows
     ]
     if any("(" in text for line in rows[1:] for text in line[1:]):
-        lines.append("in brackets: the paper's number, of other data")
+        lines.append("in brackets: the paper's number, from other data")
     return "\n".join(lines)
 
 
 def csv_table(plan: Plan, results: Sequence[Result], link: Link) -> str:
-    """Return all numbers as CSV: a line for each run, then for each row and subject, for each row, and of the paper.
+    """Return all numbers as CSV: one line per run, per row and subject, per row, and per row of the paper.
 
-    The columns `level` (run, subject, all, paper), `row`, `subject`, `seed`, `state`, `runs`, `counted`, `reason` say what a
-    line is; a number is followed by its standard deviation over seeds, and empty where there is none.
+    The columns `level` (run, subject, all, paper), `row`, `subject`, `seed`, `state`, `runs`, `counted`, `reason` identify the
+    line. Each number is followed by its standard deviation over seeds; missing numbers are empty.
     """
     columns = [*COLUMNS, *more_columns(results)]
     fields = ["level", "row", "label", "subject", "seed", "state", "runs", "counted", "reason"]
@@ -117,7 +117,7 @@ def csv_table(plan: Plan, results: Sequence[Result], link: Link) -> str:
 
 
 def order_lines(plan: Plan, results: Sequence[Result]) -> list[str]:
-    """Return how each system compares with the next one in the papers' order: surface IoU out of distribution, points."""
+    """Return the difference of each system to the next one in the papers' order: surface IoU out of distribution, points."""
     column = next(column for column in COLUMNS if column.key == "surface_ood")
     rows = {row.key: row for row in plan.experiment.rows}
     ordered = [rows[key] for key in plan.experiment.order if key in rows]
@@ -125,19 +125,19 @@ def order_lines(plan: Plan, results: Sequence[Result]) -> list[str]:
     for better, worse in itertools.pairwise(ordered):
         first, second = (summarise(_of(results, row, None), column) for row in (better, worse))
         pair = f"{better.label} over {worse.label}"
-        if not _is_whole(first) or not _is_whole(second):
-            lines.append(f"{pair}: not known, since not all runs are done")
+        if first.mean is None or second.mean is None or not (_is_whole(first) and _is_whole(second)):
+            lines.append(f"{pair}: unknown, since not all runs are done")
             continue
         difference = first.mean - second.mean
         noise = _noise(first, second)
-        known = " (one seed: its noise is not known)" if noise is None else f", standard deviation over seeds {noise:.1f}"
+        known = " (one seed: noise unknown)" if noise is None else f", standard deviation over seeds {noise:.1f}"
         verdict = "holds" if difference >= 0 else "within noise" if noise and -difference <= noise else "does not hold"
         lines.append(f"{pair}: {difference:+.1f} points{known}: {verdict}")
     return lines
 
 
 def more_columns(results: Sequence[Result]) -> list[Column]:
-    """Return those of the further columns that some run has."""
+    """Return the further columns for which a run has a number."""
     return [column for column in MORE_COLUMNS if any(column.key in result.values for result in results)]
 
 
@@ -160,7 +160,7 @@ def _is_whole(cell: Cell) -> bool:
 
 
 def _noise(first: Cell, second: Cell) -> float | None:
-    """Return the standard deviation of the difference of two means, from those of both."""
+    """Return the standard deviation of the difference of two means, from the standard deviations of both."""
     if first.deviation is None or second.deviation is None:
         return None
     return (first.deviation**2 + second.deviation**2) ** 0.5

@@ -71,7 +71,7 @@ def test_a_failed_run_is_in_the_cell_and_not_averaged_away(plan):
     text = markdown_table(plan, results, lambda result, stage: None)
     assert "4 of 6:" in text
     assert "(1 diverged, 1 failed)" in text
-    assert any("not known, since not all runs are done" in line for line in order_lines(plan, results))
+    assert any("unknown, since not all runs are done" in line for line in order_lines(plan, results))
 
 
 def test_runs_that_are_not_there_are_missing(plan):

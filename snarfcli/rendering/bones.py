@@ -28,10 +28,14 @@ _LOOK = Look(body=(0.62, 0.68, 0.74))  # paler than usual, so that the bones are
 class BonedMesh(Protocol):
     """A posed mesh with its posed joints."""
 
-    label: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    joints: np.ndarray
+    @property
+    def label(self) -> str: ...
+    @property
+    def vertices(self) -> np.ndarray: ...
+    @property
+    def faces(self) -> np.ndarray: ...
+    @property
+    def joints(self) -> np.ndarray: ...
 
 
 def write_bones_figure(path: Path, title: str, skeleton: Skeleton, frames: Sequence[BonedMesh]) -> None:

@@ -82,5 +82,5 @@ def parse_turntable(text: str) -> float:
     except ValueError:
         degrees = math.nan
     if not abs(degrees) <= _FASTEST_DEG:
-        raise UserError(f"turntable: wanted true, false or at most {_FASTEST_DEG:g} degrees per second, got '{text}'")
+        raise UserError(f"turntable: wanted true, false or degrees per second up to {_FASTEST_DEG:g}, got '{text}'")
     return math.radians(degrees)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from moody_avatar import MoodyAvatar
+from failing_avatar import FailingAvatar
 
 from snarfcli.errors import UserError
 from snarfcli.rendering.animation import Animation
@@ -20,7 +20,7 @@ BENDS = [0.0, 0.3, 0.5, 0.7, 0.9, 1.2]
 
 
 def animation(folder: Path) -> Animation:
-    avatar = MoodyAvatar()
+    avatar = FailingAvatar()
     poses, translation = np.zeros((len(BENDS), 2, 3)), np.zeros((len(BENDS), 3))
     poses[:, 1, 2] = BENDS
     stage = set_stage(body_points(avatar, poses, translation), poses, parse_views(["front", "top"]))

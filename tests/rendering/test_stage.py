@@ -119,7 +119,7 @@ def test_views_and_turntables_that_cannot_be_shown_are_rejected():
     assert parse_turntable("true") == pytest.approx(math.pi / 4)
     assert parse_turntable("-90") == pytest.approx(-math.pi / 2)
     for text in ("fast", "nan", "1000", ""):
-        with pytest.raises(UserError, match="turntable: wanted true, false or at most 720 degrees per second"):
+        with pytest.raises(UserError, match="turntable: wanted true, false or degrees per second up to 720"):
             parse_turntable(text)
 
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from rivals import released_search
+from released_search import released_search
 from torch import Tensor
 
 from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences

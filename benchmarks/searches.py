@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from rivals import released_search
+from released_search import released_search
 from scenes import Scene
 from torch import Tensor
 

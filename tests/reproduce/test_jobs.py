@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from made_up_runs import fake_metrics, fake_plan, fake_samples
+from fake_runs import fake_metrics, fake_plan, fake_samples
 
 from snarfcli.files import write_json
 from snarfcli.reproduce.jobs import LOG, STATUS, JobStopped, read_status, run_command, run_job

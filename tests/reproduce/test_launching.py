@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from made_up_runs import fake_plan, fake_run
+from fake_runs import fake_plan, fake_run
 
 from snarfcli.errors import UserError
 from snarfcli.reproduce import launching

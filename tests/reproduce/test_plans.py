@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from made_up_runs import fake_plan, fake_samples
+from fake_runs import fake_plan, fake_samples
 
 from snarfcli.commands.preprocess import PreprocessConfig
 from snarfcli.commands.reproduce import resolve_training

@@ -8,7 +8,7 @@ import re
 import statistics
 
 import pytest
-from made_up_runs import fake_plan, fake_run, read
+from fake_runs import fake_plan, fake_run, read
 
 from snarfcli.reproduce.jobs import STATUS
 from snarfcli.reproduce.papers import paper_numbers, paper_source

@@ -8,7 +8,7 @@ from torch import Tensor
 from toy_avatar import ToyAvatar
 
 
-class MoodyAvatar(ToyAvatar):
+class FailingAvatar(ToyAvatar):
     """Bent by about 0.5 radians it has no surface; beyond 1.1 radians it ends its process, like the out-of-memory killer."""
 
     def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor):

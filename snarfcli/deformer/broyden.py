@@ -30,18 +30,18 @@ def broyden_roots(
     """Find canonical correspondences from the start points B_i^-1 x'.
 
     Differs from the released code in three places: the start Jacobian is exact, a step outside the grid is clamped to its
-    border (there: zero transforms), and J^-1 at the root is exact if asked for.
+    border (in that code the transforms outside are zero), and J^-1 at the root is exact if `exact_jacobian`.
 
     Args:
-        points: queries [B, N, 3], posed space, metres. Non-finite ones have no root.
-        transforms: blended transforms [B, D * H * W, 12] at the nodes.
-        starts: upper three rows of the inverse bone transforms that give a start, [B, I, 12].
-        grid: where the nodes are.
-        shape: (D, H, W).
+        points: [B, N, 3], queries, posed space, metres. Non-finite ones have no root.
+        transforms: [B, D * H * W, 12], blended transforms at the nodes.
+        starts: [B, I, 12], upper three rows of the inverse transforms of the start bones.
+        grid: the box of the nodes.
+        shape: nodes (D, H, W).
         exact_jacobian: the inverse Jacobian at the root, or the approximation left by the iteration (Fast-SNARF Eq. 15).
         tolerance: largest residual of a root, metres.
         divergence: residual at which a start is given up, metres.
-        max_steps: most steps from one start.
+        max_steps: maximum number of steps from one start.
 
     Source: SNARF Eq. 6-8; Fast-SNARF Eq. 7-9 and Sec. 4.1.
     """

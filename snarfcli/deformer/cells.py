@@ -1,4 +1,4 @@
-"""Which grid cells are searched: sets of cells and what they are made from."""
+"""Sets of grid cells to search."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ __all__ = ["cells_near", "corners_of"]
 
 
 def cells_near(grid: CanonicalGrid, shape: tuple[int, int, int], places: list[tuple[Tensor, float]]) -> Tensor:
-    """Return which cells have a corner near one of several places, bool [D-1, H-1, W-1].
+    """Return whether cells have a corner near one of several places, [D-1, H-1, W-1], bool.
 
     Args:
         grid: canonical box.
         shape: nodes (D, H, W).
-        places: segments [S, 2, 3], metres, each with the distance that still counts as near, metres. A point is a segment
-            of no length.
+        places: pairs of segments [S, 2, 3], metres, and the largest distance that counts as near, metres. A point is a segment
+            of length 0.
     """
     nodes = grid.nodes(shape).reshape(-1, 3)
     near = torch.zeros(len(nodes), dtype=torch.bool, device=nodes.device)
@@ -29,7 +29,7 @@ def cells_near(grid: CanonicalGrid, shape: tuple[int, int, int], places: list[tu
 
 
 def corners_of(cells: Tensor) -> Tensor:
-    """Return which nodes are corners of the given cells [D-1, H-1, W-1], bool [D, H, W]."""
+    """Return whether nodes are corners of the given cells [D-1, H-1, W-1], [D, H, W], bool."""
     used = cells.new_zeros([n + 1 for n in cells.shape])
     for corner in range(8):
         x, y, z = corner & 1, corner >> 1 & 1, corner >> 2 & 1

@@ -1,16 +1,16 @@
 """Complete correspondence search: the roots of d(x) = x' in the grid, cell by cell.
 
 Inside one cell T(x) is a convex combination of the eight corner transforms T_k, so d(cell) lies inside the box spanned by
-T_k [x; 1] over the corners k and the x of the cell. The queries inside that box are the only ones that can have a root in the
-cell. The first step of Newton's method from the cell's centre needs nothing but the centre's value and inverse Jacobian,
-which all queries of a cell share; where it leads too far out of the cell for how curved the field is in it, the pair is
-dropped. What remains, about three pairs for a root while an avatar trains, is solved with the exact Jacobian of the trilinear
-field. There are no start bones, and a query outside all boxes is known to have no correspondence at all.
+T_k [x; 1] over the corners k and the x of the cell. Only queries inside that box can have a root in the cell. The first step of
+Newton's method from the cell's centre needs only the value and the inverse Jacobian at the centre, which all queries of a cell
+share. If it leads too far out of the cell, given how curved the field is in it, the pair is dropped. The remaining pairs, about
+three per root while an avatar trains, are solved with the exact Jacobian of the trilinear field. There are no start bones, and
+a query outside all boxes is known to have no correspondence.
 
-This is the readable version in PyTorch, the fallback where the native library is missing. Unlike that
-(csrc/include/snarf/cell.h) it may miss two things: a second root of the same query in one cell, where the determinant of the
-Jacobian changes sign and one start is not enough; and a root in a cell more curved between its corners than _CURVED and _SLACK
-allow for.
+This is the readable version in PyTorch, for tensors without a native kernel. Unlike the native kernels
+(csrc/include/snarf/cell.h) it may miss two kinds of roots: a second root of a query in one cell, where the determinant of the
+Jacobian changes sign and one start is not enough; and a root in a cell that is more curved between its corners than _CURVED and
+_SLACK allow for.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from snarfcli.deformer.skinning import forward_jacobian
 __all__ = ["complete_roots", "posed_cell_boxes"]
 
 _QUERIES_AT_ONCE = 65_536  # bounds the memory: a query has several candidate cells
-_CELLS_AT_ONCE = 200_000  # likewise: 400 bytes of corner transforms a cell, and as much for each intermediate result
+_CELLS_AT_ONCE = 200_000  # bounds the memory: 400 bytes of corner transforms per cell, and as much per intermediate result
 _BINS_PER_SIDE = 96
-_STRAY = 0.75  # of a cell beyond the cell at which a candidate is given up; a neighbour owns the root, if there is one
-_CURVED = 2.0  # times the field's deviation from linear at the corners, for what it may be between them
+_STRAY = 0.75  # of a cell; a candidate this far outside its cell is dropped, a neighbour finds the root if there is one
+_CURVED = 2.0  # bound of the field's deviation from linear inside a cell, in units of that at its corners
 _SLACK = 0.1  # of a cell, beyond that
 _FACE_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}  # of a cell; rounding may put a root on a face outside both
-_POLISH = 1e-2  # of a cell; so short a step leaves the Jacobian as it is
+_POLISH = 1e-2  # of a cell; a step this short does not change the Jacobian noticeably
 _SAME_ROOT = 5e-3  # of a cell; Newton's last step leaves errors a hundred times smaller
 
 
@@ -48,13 +48,13 @@ def complete_roots(
     """Find the canonical correspondences of posed points in every active grid cell.
 
     Args:
-        points: queries [B, N, 3], posed space, metres. Non-finite ones have no root.
-        transforms: blended transforms [B, D * H * W, 12] at the nodes (see `blend_transforms`).
-        grid: where the nodes are.
-        shape: (D, H, W).
-        active_cells: bool [(D-1) * (H-1) * (W-1)], cells to search; None for all.
+        points: [B, N, 3], queries, posed space, metres. Non-finite ones have no root.
+        transforms: [B, D * H * W, 12], blended transforms at the nodes (see `blend_transforms`).
+        grid: the box of the nodes.
+        shape: nodes (D, H, W).
+        active_cells: [D-1, H-1, W-1], bool, cells to search; None for all.
         tolerance: largest residual of a root, metres.
-        max_steps: most Newton steps in one cell.
+        max_steps: maximum number of Newton steps in one cell.
 
     Returns:
         The roots of all queries, without duplicates.
@@ -67,7 +67,7 @@ def complete_roots(
     corners = cell_corners(cells, shape)
     origins = grid.nodes(shape).reshape(-1, 3)[corners[:, 0]]
     size = grid.cell_size(shape)
-    # Several poses go through every operation together, as long as that does not need much memory.
+    # Several poses are processed together, as far as memory allows.
     poses_at_once = max(1, min(_CELLS_AT_ONCE // max(len(cells), 1), _QUERIES_AT_ONCE // max(count, 1)))
     parts = []
     for first in range(0, batch, poses_at_once):
@@ -95,8 +95,8 @@ def posed_cell_boxes(corner_transforms: Tensor, origins: Tensor, cell_size: Tens
     """Return posed-space boxes (lower [C, 3], upper [C, 3]) that contain the image of each cell, metres.
 
     Args:
-        corner_transforms: blended transforms at the corners of the cells, [C, 8, 12].
-        origins: canonical position of each cell's first corner, [C, 3], metres.
+        corner_transforms: [C, 8, 12], blended transforms at the corners of the cells.
+        origins: [C, 3], canonical position of each cell's first corner, metres.
         cell_size: [3], metres.
     """
     start, sides = _images(corner_transforms, origins, cell_size)
@@ -104,7 +104,7 @@ def posed_cell_boxes(corner_transforms: Tensor, origins: Tensor, cell_size: Tens
 
 
 def _images(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor]:
-    """Return where the transform of each corner takes the cell's first corner, [C, 8, 3], and its sides, [C, 8, 3, 3].
+    """Return the images of the cell's first corner, [C, 8, 3], and of its sides, [C, 8, 3, 3], under each corner's transform.
 
     Column i of the sides is the image of the cell's side along axis i.
     """
@@ -120,8 +120,8 @@ def _candidates(points: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, T
     The queries are sorted into uniform bins, x fastest, so that a run of bins along x is one contiguous range of queries.
 
     Args:
-        points: queries [G, N, 3] of G poses; numbered g * N + n in the result.
-        lower, upper: boxes [G * C, 3] of C cells in each pose; numbered g * C + c in the result.
+        points: [G, N, 3], queries of G poses; numbered g * N + n in the result.
+        lower, upper: [G * C, 3], boxes of C cells in each pose; numbered g * C + c in the result.
     """
     poses, count = points.shape[:2]
     flat = points.reshape(-1, 3)
@@ -129,7 +129,7 @@ def _candidates(points: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, T
     if not len(flat) or not bool(boxed.any()):
         nothing = torch.empty(0, dtype=torch.long, device=points.device)
         return nothing, nothing
-    # Queries beyond every box need no bin of their own, and non-finite ones compare false.
+    # Queries outside every box need no bin; comparisons with non-finite ones are false.
     known = ((flat >= lower[boxed].amin(0)) & (flat <= upper[boxed].amax(0))).all(1).nonzero()[:, 0]
     if not len(known):
         return known, known
@@ -165,17 +165,17 @@ def _candidates(points: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, T
 
 
 def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return, for every one of counts.sum() items, its owner's index and its number within the owner."""
+    """Return, for each of counts.sum() items, the index of its owner and its number within the owner."""
     owner = torch.repeat_interleave(counts)
     return owner, torch.arange(len(owner), device=counts.device) - (counts.cumsum(0) - counts)[owner]
 
 
 def _centres(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the first Newton step in each cell needs.
+    """Return the values at cell centres that the first Newton step needs.
 
     Returns:
-        Posed centres [C, 3], metres; inverse Jacobians [C, 3, 3] there, to cell coordinates; and how far from the centre, in
-        cell coordinates, that step may lead and the cell still hold a root, [C].
+        Posed centres [C, 3], metres; inverse Jacobians [C, 3, 3] there, to cell coordinates; and the largest length of that
+        step, in cell coordinates, at which the cell can still hold a root, [C].
     """
     middle = torch.full_like(origins, 0.5)
     posed, jacobian = forward_jacobian(corner_transforms, middle, origins, cell_size)
@@ -192,7 +192,7 @@ def _centres(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> t
 def _first_step(
     points: Tensor, query: Tensor, cell: Tensor, centres: Tensor, inverse: Tensor, reach: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Take Newton's step from the centre for each pair; return the pairs that may be roots and where it led, [P, 3]."""
+    """Take Newton's step from the centre for each pair; return the pairs that may be roots and their positions, [P, 3]."""
     offset = points.index_select(0, query) - centres.index_select(0, cell)
     step = torch.bmm(inverse.index_select(0, cell), offset[:, :, None])[:, :, 0].nan_to_num(0, 0, 0)
     possible = (step.abs().amax(1) <= reach[cell]).nonzero()[:, 0]
@@ -233,7 +233,7 @@ def _newton(
         from_centre = (local - 0.5).abs().amax(1)
         done = (converged & (from_centre <= reach)).nonzero()[:, 0]
         found.append((query[done], cell[done], local[done], inverse[done] * cell_size[:, None]))
-        # Steps grow shorter towards a root: one that ends farther outside the cell than it was long will not come back.
+        # Steps grow shorter towards a root: one that ends farther outside the cell than its length will not return.
         going = (~converged & (from_centre - 0.5 < longest[:, 0].clamp_max(_STRAY))).nonzero()[:, 0]
         query, cell, local = (pairs.index_select(0, going) for pairs in (query, cell, local))
     query, cell, local, inverse = (torch.cat(parts) for parts in zip(*found, strict=True))

@@ -134,9 +134,11 @@ class ForwardDeformer(nn.Module):
         """
         if self.searches_field:
             return None
-        only = self.search.name == "complete" if active_only is None else active_only
+        return self._node_weights(self.search.name == "complete" if active_only is None else active_only)
+
+    def _node_weights(self, active_only: bool) -> NodeWeights:
         with torch.autocast(self.lower.device.type, enabled=False):
-            return NodeWeights(self.weight_grid(active_only=only), self.grid)
+            return NodeWeights(self.weight_grid(active_only), self.grid)
 
     def skinning_weights(self, canonical: Tensor, weights: NodeWeights | None = None) -> Tensor:
         """Return the skinning weights [N, J] at canonical points [N, 3], as the search uses them.
@@ -191,7 +193,8 @@ class ForwardDeformer(nn.Module):
                         "capacity: wanted None for a field that is searched directly; it needs a search on the grid"
                     )
                 return find_correspondences_on_field(points, bone_transforms, self.field, self.grid, search=self.search)
-            weights = self.node_weights() if weights is None else weights
+            complete = self.search.name == "complete"
+            weights = self._node_weights(active_only=complete) if weights is None else weights
             sums_to_one = isinstance(self.field, WeightField)
             if sums_to_one:
                 check_transforms(bone_transforms)
@@ -201,7 +204,7 @@ class ForwardDeformer(nn.Module):
                 weights.values,
                 self.grid,
                 search=self.search,
-                active_cells=self.active_cells if self.search.name == "complete" else None,
+                active_cells=self.active_cells if complete else None,
                 capacity=capacity,
                 check=not sums_to_one,
             )

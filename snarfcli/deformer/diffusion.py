@@ -1,4 +1,4 @@
-"""Given skinning weights: from the vertices of a mesh into the whole canonical grid."""
+"""Given skinning weights: extended from the vertices of a mesh to the whole canonical grid."""
 
 from __future__ import annotations
 
@@ -11,25 +11,28 @@ from snarfcli.deformer.weights import GridWeights
 
 __all__ = ["PresetWeights", "diffuse_weights"]
 
-_NEIGHBOURS = 8  # vertices that a node near the surface takes its weights from
+_NEIGHBOURS = 8  # vertices that determine the weights of a node near the surface
 _NODES_AT_ONCE = 4096  # bounds the memory of the distances to all vertices
 _ROUNDS = 3  # mean error at the vertices of the built-in body, 64 x 64 x 16: none 3.0 %, 3 rounds 2.0 %, 100 rounds 1.7 %
-_SMALL = 10_000  # nodes of a grid on which heat spreads fast enough
+_SMALL = 10_000  # number of nodes of a grid on which the solver converges fast enough
 _SUM_TOLERANCE = 1e-3  # files often hold weights in single precision, cut to a few bones
-_SOLVED = 1e-4  # largest change of a weight that one more step would make; 10 times less moves no weight by more than 0.5 %
+_SOLVED = 1e-4  # largest change of a weight by one more step; a tenth of it changes no weight by more than 0.5 %
 _MOST_STEPS = 2000
 
 
 class PresetWeights(GridWeights):
-    """Weights at the grid nodes that are given and never trained.
+    """Weights at the grid nodes that are given and not trained.
 
     Args:
         grid: its box.
-        weights: [D, H, W, J] at the nodes.
+        weights: [D, H, W, J], at the nodes.
     """
 
+    weights: Tensor
+
     def __init__(self, grid: CanonicalGrid, weights: Tensor) -> None:
-        super().__init__(grid, tuple(weights.shape[:3]))
+        depth, height, width = weights.shape[:3]
+        super().__init__(grid, (depth, height, width))
         self.register_buffer("weights", weights.detach().reshape(-1, weights.shape[-1]).clone())
 
     @classmethod
@@ -55,7 +58,7 @@ def diffuse_weights(vertices: Tensor, weights: Tensor, grid: CanonicalGrid, shap
     The corners of every cell that holds a vertex take the weights of the nearest vertices, corrected so that the trilinear
     field meets the weights at the vertices as far as the cells allow. Between and beyond them the weights are harmonic, as
     heat is at rest: each free node has the mean of its neighbours (weighted by 1 / distance^2, with nothing flowing through
-    the border of the box). Such a mean is never negative, sums to 1, and has no extremes of its own.
+    the border of the box). Such a mean is never negative, sums to 1, and adds no extremes.
 
     Args:
         vertices: [V, 3], canonical frame, metres; inside the grid's box.
@@ -64,7 +67,7 @@ def diffuse_weights(vertices: Tensor, weights: Tensor, grid: CanonicalGrid, shap
         shape: nodes (D, H, W).
 
     Returns:
-        [D, H, W, J], non-negative, rows sum to 1, with the dtype and on the device of `grid`.
+        [D, H, W, J], non-negative, rows sum to 1, with the dtype and device of `grid`.
 
     Raises:
         ValueError: a shape does not fit, a number is not finite, a weight is negative, a row does not sum to 1 (within 1e-3),
@@ -76,7 +79,7 @@ def diffuse_weights(vertices: Tensor, weights: Tensor, grid: CanonicalGrid, shap
 
 
 def _diffuse(points: Tensor, weights: Tensor, grid: CanonicalGrid, shape: tuple[int, int, int]) -> Tensor:
-    """Do the work of `diffuse_weights`, on a grid of half the resolution first, since heat takes long over many cells."""
+    """Solve `diffuse_weights`, first on a grid of half the resolution, since diffusion is slow over many cells."""
     nodes = grid.nodes(shape).reshape(-1, 3)
     if len(nodes) > _SMALL and min(shape) > 2:
         half = (shape[0] // 2 + 1, shape[1] // 2 + 1, shape[2] // 2 + 1)
@@ -96,10 +99,10 @@ def _diffuse(points: Tensor, weights: Tensor, grid: CanonicalGrid, shape: tuple[
 
 
 def _near_surface(nodes: Tensor, vertices: Tensor, weights: Tensor) -> Tensor:
-    """Return weights [K, J] at nodes [K, 3] from their nearest vertices, the nearer the more.
+    """Return weights [K, J] at nodes [K, 3] from their nearest vertices; nearer vertices weigh more.
 
-    The share of a vertex falls with its distance beyond that of the nearest one, by the scale of how far the neighbours lie
-    apart; so a node between two vertices gets a mean, and one on a vertex almost that vertex's weights.
+    The share of a vertex falls with its distance beyond that of the nearest one, relative to the distances between the
+    neighbours; so a node between two vertices gets a mean, and one on a vertex almost the weights of that vertex.
     """
     count = min(_NEIGHBOURS, len(vertices))
     parts = []
@@ -116,15 +119,15 @@ def _near_surface(nodes: Tensor, vertices: Tensor, weights: Tensor) -> Tensor:
 
 
 def _corrected(values: Tensor, corner: Tensor, phi: Tensor, weights: Tensor) -> Tensor:
-    """Return node values [K, J] that interpolate to more exactly the given weights [V, J] at the vertices.
+    """Correct node values [K, J] so that they interpolate to the given weights [V, J] at the vertices more exactly.
 
-    Each round spreads what a vertex lacks over the corners of its cell, by their trilinear weights. Since all rows sum to 1,
-    what is spread sums to 0. More rounds follow the vertices more closely and are wrong beside them.
+    Each round spreads the error of a vertex over the corners of its cell, by their trilinear weights. Since all rows sum to 1,
+    an error sums to 0. More rounds follow the vertices more closely but are wrong beside them.
 
     Args:
         values: [K, J], rows sum to 1.
-        corner: the K nodes that are the corners of each vertex's cell, [V, 8].
-        phi: their trilinear weights, [V, 8].
+        corner: [V, 8], numbers of the nodes at the corners of each vertex's cell, 0 to K - 1.
+        phi: [V, 8], their trilinear weights.
         weights: [V, J], rows sum to 1.
     """
     mass = values.new_zeros(len(values)).index_add(0, corner.reshape(-1), phi.reshape(-1)).clamp_min(1e-6)[:, None]
@@ -177,25 +180,25 @@ def _harmonic(start: Tensor, fixed: Tensor, cell_size: Tensor) -> Tensor:
 
 
 def _check(vertices: Tensor, weights: Tensor, grid: CanonicalGrid) -> None:
-    """Refuse vertices and weights that cannot be used."""
+    """Raise ValueError for vertices and weights that cannot be used."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
-        raise ValueError(f"vertices must have shape [V, 3], at least one, got {list(vertices.shape)}")
+        raise ValueError(f"vertices: wanted shape [V, 3], at least one, got {list(vertices.shape)}")
     if weights.ndim != 2 or len(weights) != len(vertices) or not weights.shape[1]:
-        raise ValueError(f"weights must have shape [{len(vertices)}, J], a row for each vertex, got {list(weights.shape)}")
+        raise ValueError(f"weights: wanted shape [{len(vertices)}, J], one row per vertex, got {list(weights.shape)}")
     for name, tensor in (("vertices", vertices), ("weights", weights)):
         if not bool(tensor.isfinite().all()):
-            raise ValueError(f"{name} must be finite, got NaN or infinite values")
+            raise ValueError(f"{name}: wanted finite numbers, got NaN or infinite ones")
     if bool((weights < 0).any()):
-        raise ValueError(f"weights must not be negative, got {float(weights.min()):g}")
+        raise ValueError(f"weights: wanted 0 or more, got {float(weights.min()):g}")
     sums = weights.double().sum(1)
     if bool(((sums - 1).abs() > _SUM_TOLERANCE).any()):
-        raise ValueError(f"weights must sum to 1 for each vertex, got sums from {float(sums.min()):g} to {float(sums.max()):g}")
+        raise ValueError(f"weights: wanted a sum of 1 per vertex, got sums from {float(sums.min()):g} to {float(sums.max()):g}")
     points = vertices.to(grid.lower)
     outside = int(((points < grid.lower) | (points > grid.upper)).any(1).sum())
     if outside:
         raise ValueError(
-            f"vertices must lie in the canonical box from {_text(grid.lower)} to {_text(grid.upper)} metres, got {outside} of "
-            f"{len(vertices)} outside, in a box from {_text(points.amin(0))} to {_text(points.amax(0))}"
+            f"vertices: wanted all in the canonical box from {_text(grid.lower)} to {_text(grid.upper)} metres, "
+            f"got {outside} of {len(vertices)} outside, in a box from {_text(points.amin(0))} to {_text(points.amax(0))}"
         )
 
 

@@ -1,4 +1,4 @@
-"""The canonical voxel grid: where its nodes are, and trilinear interpolation between them."""
+"""The canonical voxel grid: the positions of its nodes, and trilinear interpolation between them."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ CORNERS = torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])
 class CanonicalGrid:
     """An axis-aligned box in canonical space whose outermost grid nodes lie on its corners.
 
-    The number of nodes is not kept here: it is the shape [D, H, W] (z, y, x) of whatever array is laid over the box.
+    The number of nodes is not kept here: it is the shape [D, H, W] (z, y, x) of the array that is laid over the box.
     """
 
     lower: Tensor
-    """Corner with the smallest coordinates, [3], metres."""
+    """[3], corner with the smallest coordinates, metres."""
     upper: Tensor
-    """Corner with the largest coordinates, [3], metres."""
+    """[3], corner with the largest coordinates, metres."""
     checked: InitVar[bool] = False
-    """Whether the corners are known to be right; looking at them waits for a GPU."""
+    """Whether the corners have been checked already; a check forces a synchronisation on a GPU."""
 
     def __post_init__(self, checked: bool) -> None:
         if checked:
             return
         for name in ("lower", "upper"):
             if tuple(getattr(self, name).shape) != (3,):
-                raise ValueError(f"grid.{name} must have shape [3], got {list(getattr(self, name).shape)}")
+                raise ValueError(f"grid.{name}: wanted shape [3], got {list(getattr(self, name).shape)}")
         if not bool((self.upper > self.lower).all()):
-            raise ValueError(f"grid.upper must exceed grid.lower, got {self.lower.tolist()} and {self.upper.tolist()}")
+            raise ValueError(f"grid.upper: wanted more than grid.lower, got {self.upper.tolist()} and {self.lower.tolist()}")
 
     @classmethod
     def around(cls, points: Tensor, margin: Sequence[float]) -> CanonicalGrid:

@@ -1,4 +1,4 @@
-"""From a network's logits to skinning weights: a plain softmax over the bones, or one down the tree of joints."""
+"""Softmaxes from a network's logits to skinning weights: over all bones, or down the tree of joints."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _LOWEST_LOG = -1e4  # stands for the logarithm of a weight of zero
 
 
 class PlainSoftmax(nn.Module):
-    """One logit for each bone.
+    """Softmax with one logit per bone.
 
     Source: SNARF Sec. 3.1, which makes weights non-negative and sum to 1 "using a softmax activation function" and names no
-    other; it is what the released settings choose, too.
+    other; the released settings use it too.
     """
 
     def __init__(self, num_bones: int) -> None:
@@ -36,16 +36,16 @@ class PlainSoftmax(nn.Module):
 
 
 class HierarchicalSoftmax(nn.Module):
-    """Weights as the chances of a walk down the tree of joints: choose a root, then at each joint stop or go on to a child.
+    """Weights as probabilities of a walk down the tree of joints: choose a root, then at each joint stop or go on to a child.
 
-    The weight of a joint is the chance that the walk stops there, so all weights sum to 1. Two branches compete where they
-    part and nowhere else: a foot takes nothing directly from a hand, whatever the network says of both. The papers describe
-    the plain softmax only (SNARF Sec. 3.1); this one is an alternative to it.
+    The weight of a joint is the probability that the walk stops there, so all weights sum to 1. Two branches compete only where
+    they part: a foot takes nothing directly from a hand, for any logits. The papers describe the plain softmax only (SNARF
+    Sec. 3.1); this one is an alternative to it.
 
-    A joint that has siblings has a logit against them (several roots are siblings), and a joint that has children one for
-    stopping; `num_logits` is the number of both together, 25 for the 24 joints of SMPL. The logits of the first kind come
-    first, each kind in the order of the joints. Everything is computed as sums of logarithms, so that long chains and large
-    logits neither overflow nor lose their gradients.
+    A joint with siblings has one logit against them (several roots are siblings), and a joint with children has one for
+    stopping; `num_logits` is the number of both, 25 for the 24 joints of SMPL. The logits of the first kind come first, each
+    kind in the order of the joints. All is computed as sums of logarithms, so that long chains and large logits neither
+    overflow nor lose their gradients.
 
     Args:
         parents: parent of each of the J joints, negative for a root; in any order, with any number of roots.
@@ -53,6 +53,12 @@ class HierarchicalSoftmax(nn.Module):
     Raises:
         ValueError: `parents` is empty, names a joint that does not exist, or contains a cycle.
     """
+
+    _choice: Tensor
+    _stop: Tensor
+    _go: Tensor
+    _members: Tensor
+    _strides: Tensor
 
     def __init__(self, parents: Sequence[int]) -> None:
         super().__init__()
@@ -71,14 +77,14 @@ class HierarchicalSoftmax(nn.Module):
         self._contested, self._inner = contested, inner
         self._groups = [group for group in children.values() if len(group) > 1]
 
-        # Columns of [0, the groups' values one after the other]; column 0 stands for a joint without siblings.
+        # Columns of [0, the values of all groups]; column 0 stands for a joint without siblings.
         order = [joint for group in self._groups for joint in group]
         choice = [1 + order.index(joint) if joint in order else 0 for joint in range(len(parents))]
-        # Columns of [0, the inner joints' values]; column 0 stands for a last joint, or for what is above a root.
+        # Columns of [0, the inner joints' values]; column 0 stands for a last joint, or for the level above a root.
         stop = [1 + inner.index(joint) if joint in inner else 0 for joint in range(len(parents))]
         go = [stop[parent] if parent >= 0 else 0 for parent in parents]
         members = [contested.index(joint) for joint in order]
-        # Sums along the way from the root by doubling the stride; the place J holds a zero for what is above the roots.
+        # Sums along the path from the root by doubling the stride; the place J holds a zero for the level above the roots.
         up = torch.tensor([parent if parent >= 0 else len(parents) for parent in parents] + [len(parents)])
         strides = []
         for _ in range(max(depths).bit_length()):
@@ -121,6 +127,7 @@ class HierarchicalSoftmax(nn.Module):
 
 
 SOFTMAXES = ("plain", "hierarchical")
+"""Names of the softmaxes."""
 
 
 def make_softmax(name: str, num_bones: int, parents: Sequence[int] | None = None) -> PlainSoftmax | HierarchicalSoftmax:
@@ -132,32 +139,32 @@ def make_softmax(name: str, num_bones: int, parents: Sequence[int] | None = None
         parents: parent of each bone, negative for a root.
 
     Raises:
-        ValueError: another name, or parents that are missing, do not fit or form no tree.
+        ValueError: unknown name, or parents are missing, do not fit or do not form a tree.
     """
     if name not in SOFTMAXES:
-        raise ValueError(f"skinning.softmax must be one of {', '.join(SOFTMAXES)}, got {name!r}")
-    if name == "plain" or num_bones == 1:  # one bone leaves nothing to choose: a network without outputs
+        raise ValueError(f"skinning.softmax: wanted {' or '.join(SOFTMAXES)}, got {name!r}")
+    if name == "plain" or num_bones == 1:  # with one bone a hierarchy has no logits
         return PlainSoftmax(num_bones)
     if parents is None:
-        raise ValueError("skinning.softmax='hierarchical' needs parents, the parent of each bone")
+        raise ValueError("parents: wanted the parent of each bone for skinning.softmax 'hierarchical', got None")
     if len(parents) != num_bones:
-        raise ValueError(f"parents must name the parent of each of the {num_bones} bones, got {len(parents)}")
+        raise ValueError(f"parents: wanted one for each of the {num_bones} bones, got {len(parents)}")
     return HierarchicalSoftmax(parents)
 
 
 def _depths(parents: list[int]) -> list[int]:
-    """Return how many steps each joint is below its root."""
+    """Return the number of steps from each joint up to its root."""
     if not parents:
-        raise ValueError("parents must name at least one joint, got none")
+        raise ValueError("parents: wanted at least one joint, got none")
     depths = []
     for joint, parent in enumerate(parents):
         depth, above = 0, parent
         while above >= 0:
             if above >= len(parents):
-                raise ValueError(f"parents must lie below {len(parents)}, got {above}")
+                raise ValueError(f"parents: wanted numbers below {len(parents)}, got {above}")
             depth += 1
             if depth >= len(parents):
-                raise ValueError(f"parents must form a tree, got a cycle at or above joint {joint}")
+                raise ValueError(f"parents: wanted a tree, got a cycle at or above joint {joint}")
             above = parents[above]
         depths.append(depth)
     return depths

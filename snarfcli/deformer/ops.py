@@ -12,6 +12,7 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch._library.custom_ops import CustomOpDef
 
 from snarfcli.deformer.blending import raise_for_second_derivative
 from snarfcli.deformer.broyden import broyden_roots
@@ -225,7 +226,7 @@ def _check_default_kernel(tensor: Tensor, backend: str) -> None:
     choose_backend(backend, tensor.device.type)
 
 
-def _register_native(operator: torch.library.CustomOpDef, device_type: str, native: Callable, reference: Callable) -> None:
+def _register_native(operator: CustomOpDef, device_type: str, native: Callable, reference: Callable) -> None:
     """Register `native` for one type of device, or `reference` where `backend`, the last argument, says so."""
 
     @operator.register_kernel(device_type)
@@ -255,8 +256,8 @@ def _reference_result(roots: Roots, orientation_preserving: bool) -> tuple[Tenso
 # ---------------------------------------------------------------- shapes
 def _fake_roots(points: Tensor, capacity: int | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     rows = torch.library.get_ctx().new_dynamic_size() if capacity is None else capacity
-    long = {"dtype": torch.long}
-    return points.new_empty(rows, 3), points.new_empty(rows, **long), points.new_empty(rows, 3, 3), points.new_empty(1, **long)
+    query, total = (points.new_empty(size, dtype=torch.long) for size in (rows, 1))
+    return points.new_empty(rows, 3), query, points.new_empty(rows, 3, 3), total
 
 
 @complete_search.register_fake

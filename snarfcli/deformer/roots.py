@@ -1,4 +1,4 @@
-"""What the searches share: the set of roots they return, and small linear algebra."""
+"""Shared by the searches: the set of roots that they return, and small linear algebra."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Roots:
     canonical: Tensor
     """[M, 3], metres."""
     query: Tensor
-    """Flat index b * N + n of each root's query, [M], ascending."""
+    """[M], index b * N + n of each root's query, ascending."""
     jacobian_inverse: Tensor
-    """Inverse of dd/dx at the root, [M, 3, 3]."""
+    """[M, 3, 3], inverse of dd/dx at the root."""
 
     @classmethod
     def concatenate(cls, parts: list[Roots]) -> Roots:

@@ -16,12 +16,12 @@ def skin(canonical: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
     """Move canonical points into the posed frame by linear blend skinning.
 
     Args:
-        canonical: points [N, 3], canonical frame, metres.
-        weights: skinning weights [N, J], non-negative, rows sum to 1.
+        canonical: [N, 3], points, canonical frame, metres.
+        weights: [N, J], skinning weights, non-negative, rows sum to 1.
         bone_transforms: [J, 4, 4], canonical to posed, metres.
 
     Returns:
-        Posed points [N, 3], metres.
+        Posed points, [N, 3], metres.
 
     Source: SNARF Eq. 4.
     """
@@ -38,7 +38,7 @@ def blend_transforms(
     Args:
         skinning_weights: [D, H, W, J] at the grid nodes.
         bone_transforms: [B, J, 4, 4], canonical to posed.
-        active_cells: bool [D-1, H-1, W-1]; other nodes than their corners may get zeros. None for all.
+        active_cells: [D-1, H-1, W-1], bool; other nodes than their corners may get zeros. None for all.
         backend: "auto", "native" or "reference".
 
     Returns:
@@ -51,7 +51,7 @@ def blend_transforms(
 
 
 def interpolate(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:
-    """Interpolate node values [D, H, W, C] at canonical points [N, 3]; points outside get the border's values.
+    """Interpolate node values [D, H, W, C] at canonical points [N, 3]; points outside get the values of the border.
 
     Returns:
         [N, C].
@@ -67,9 +67,9 @@ def forward_jacobian(corner_transforms: Tensor, local: Tensor, origin: Tensor, c
     """Evaluate d(x) = T(x) [x; 1] and its exact Jacobian inside grid cells.
 
     Args:
-        corner_transforms: blended transforms at the corners of each point's cell, [M, 8, 12].
-        local: coordinates in the cell, [M, 3], 0 to 1 inside.
-        origin: canonical position of the cell's first corner, [M, 3], metres.
+        corner_transforms: [M, 8, 12], blended transforms at the corners of each point's cell.
+        local: [M, 3], coordinates in the cell, 0 to 1 inside.
+        origin: [M, 3], canonical position of the cell's first corner, metres.
         cell_size: [3], metres.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Weight fields: where the skinning weights of canonical points come from."""
+"""Weight fields: skinning weights as functions of canonical points."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWe
 
 
 class WeightField(nn.Module):
-    """Skinning weights of canonical points: the one thing that a deformer asks of its field.
+    """Interface of a weight field.
 
     A field is called with canonical points [N, 3], metres, and returns weights [N, J], non-negative, rows sum to 1. Each row
-    depends on its own point only. `ForwardDeformer` takes any other callable of this kind as well.
+    depends on its point only. `ForwardDeformer` accepts any other callable of this kind as well.
     """
 
     def set_box(self, grid: CanonicalGrid) -> None:
-        """Take over the canonical box that the deformer has read from a file."""
+        """Update the canonical box, after the deformer has loaded another from a state."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,19 @@ class NodeWeights:
 
 
 class BonePrior(nn.Module):
-    """Logits of skinning weights that fall with the distance to each bone: what a skeleton alone says of them.
+    """Logits of skinning weights that fall with the distance to each bone, computed from the skeleton alone.
 
-    At a joint its own bone and its parent's are equally near, which is the value that SNARF Sec. 3.3 asks for there.
+    At a joint its bone and its parent's bone are equally near, as SNARF Sec. 3.3 wants them there.
 
     Args:
-        segments: ends of the bones' segments, [S, 2, 3], canonical frame, metres.
-        owner: which bone each segment belongs to, S numbers; every bone needs one.
+        segments: [S, 2, 3], ends of the bones' segments, canonical frame, metres.
+        owner: S bone numbers, the bone of each segment; every bone needs at least one.
         num_bones: J.
         falloff: distance over which a weight falls by a factor e, metres.
     """
+
+    segments: Tensor
+    owner: Tensor
 
     def __init__(self, segments: Tensor, owner: Sequence[int], num_bones: int, falloff: float) -> None:
         super().__init__()
@@ -71,16 +74,17 @@ class BonePrior(nn.Module):
 class NetworkWeights(WeightField):
     """Skinning weights as a small network.
 
-    Evaluated at the grid nodes it makes the field smooth, and the search only ever sees its values at the nodes (Fast-SNARF
-    Sec. 4.2); searched directly it is SNARF's own field (SNARF Eq. 3).
+    Evaluated at the grid nodes it makes the field smooth, and the search only sees its values at the nodes (Fast-SNARF
+    Sec. 4.2); searched directly it is SNARF's field (SNARF Eq. 3).
 
     Args:
-        softmax: from logits to weights; says how many logits the network has.
+        softmax: from logits to weights; determines the number of logits.
         grid: its box; coordinates are scaled to [-1, 1] in it before they enter the network.
-        width, depth: size of the hidden layers and their number.
+        width: width of the hidden layers.
+        depth: number of hidden layers.
         sharpness: factor before the softmax over the bones (20 in the released Fast-SNARF).
         weight_norm: whether the layers are weight-normalised, as in the papers.
-        prior: logits of a plain softmax that the network only corrects; the field then starts as the prior alone.
+        prior: logits of a plain softmax that the network only corrects; the field then starts as the prior.
     """
 
     def __init__(
@@ -110,7 +114,7 @@ class NetworkWeights(WeightField):
         self.set_box(grid)
 
     def set_box(self, grid: CanonicalGrid) -> None:
-        """Scale coordinates by another box."""
+        """Scale coordinates by a new box."""
         self.centre, self.half_extent = (grid.lower + grid.upper) / 2, (grid.upper - grid.lower) / 2
 
     def forward(self, canonical: Tensor) -> Tensor:
@@ -139,7 +143,7 @@ class GridWeights(WeightField):
         self.register_buffer("upper", grid.upper.clone(), persistent=False)
 
     def set_box(self, grid: CanonicalGrid) -> None:
-        """Lay the nodes over another box."""
+        """Lay the nodes over a new box."""
         self.lower, self.upper = grid.lower.clone(), grid.upper.clone()
 
     def at_nodes(self, nodes: Tensor | None = None) -> Tensor:
@@ -156,15 +160,15 @@ class GridWeights(WeightField):
 class VoxelWeights(GridWeights):
     """Weights that are optimised directly at the grid nodes.
 
-    Fast-SNARF Sec. 4.2 mentions this field, with a total-variation loss (`total_variation`), and found the distilled one
-    smoother and more accurate.
+    Fast-SNARF Sec. 4.2 mentions this field, with a total-variation loss (`total_variation`), and reports that the distilled one
+    is smoother and more accurate.
 
     Args:
         softmax: from logits to weights.
         grid: its box.
         shape: nodes (D, H, W).
         sharpness: factor before the softmax, which makes steps of the optimiser as large as those of the distilled field.
-        prior: logits of a plain softmax to start from; without it all bones weigh the same everywhere.
+        prior: logits of a plain softmax to start from; without it all weights are equal at first.
     """
 
     def __init__(
@@ -188,16 +192,16 @@ class VoxelWeights(GridWeights):
 
 
 def total_variation(weights: Tensor, grid: CanonicalGrid, used: Tensor | None = None) -> Tensor:
-    """Return how much weights change from node to node, per metre: summed over bones and axes, averaged over neighbours.
+    """Return the change of weights from node to node, per metre: summed over bones and axes, averaged over neighbours.
 
     The same field has the same value on a finer grid.
 
     Args:
-        weights: [D, H, W, J] at the grid nodes.
+        weights: [D, H, W, J], at the grid nodes.
         grid: the box of the nodes.
-        used: bool [D, H, W]; pairs with a node outside are left out. None for all.
+        used: [D, H, W], bool; only pairs of these nodes count. None for all.
 
-    Source: the regulariser that Fast-SNARF Sec. 4.2 mentions; the norm is ours.
+    Source: the regulariser that Fast-SNARF Sec. 4.2 mentions; the norm is our choice.
     """
     size = grid.cell_size(weights.shape[:3])
     total = weights.new_zeros(())

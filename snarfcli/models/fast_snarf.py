@@ -55,6 +55,8 @@ class FastSnarf(System):
     """
 
     has_skinning_weights: ClassVar[bool] = True
+    _kept_cells: Tensor | None
+    _canonical_pose: Tensor
 
     def __init__(
         self,

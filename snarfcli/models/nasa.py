@@ -63,6 +63,10 @@ class Nasa(PointwiseSystem):
 
     needs_template: ClassVar[bool] = True
     has_canonical_shape: ClassVar[bool] = False
+    shape: PartNetworks
+    _segments: Tensor
+    _vertices: Tensor | None
+    _vertex_weights: Tensor | None
 
     def __init__(
         self,
@@ -82,7 +86,7 @@ class Nasa(PointwiseSystem):
             given = None if values is None else torch.tensor(values, dtype=torch.float32)
             self.register_buffer(name, given, persistent=False)
 
-    def _make_shape(self, bones: Tensor) -> nn.Module:
+    def _make_shape(self, bones: Tensor) -> PartNetworks:
         return PartNetworks(self.config.model, self.num_bones)
 
     def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
@@ -110,15 +114,15 @@ class Nasa(PointwiseSystem):
             with network_precision(precision, points.device):
                 logits.append(self.shape(local / _UNIT_M, frames.root / _ROOT_UNIT_M).to(points.dtype))
             if self.config.shape.prior_radius_m is not None:
-                logits[-1] = logits[-1] + self._capsules(local)
+                logits[-1] = logits[-1] + self._capsules(local, self.config.shape.prior_radius_m)
         return torch.cat(logits, 2)
 
     @torch.no_grad()
-    def _capsules(self, local: Tensor) -> Tensor:
-        """Return the logits [B, J, N] of the capsules around each part's own segments at points in its frame [B, J, N, 3]."""
+    def _capsules(self, local: Tensor, radius_m: float) -> Tensor:
+        """Return the logits [B, J, N] of the capsules around the segments of each part at points in its frame [B, J, N, 3]."""
         own = zip(local.unbind(1), self._segments, strict=True)
         distance = torch.stack([distance_to_segments(x.flatten(0, 1), segments).view(x.shape[:2]) for x, segments in own], 1)
-        return LOGITS_PER_METRE * (self.config.shape.prior_radius_m - distance)
+        return LOGITS_PER_METRE * (radius_m - distance)
 
     def bone_logits(
         self,
@@ -142,6 +146,8 @@ class Nasa(PointwiseSystem):
         config = self.config.model
         if config.part_weight <= 0:
             return {}
+        if self._vertices is None or self._vertex_weights is None:
+            raise ValueError(f"template: wanted the subject's mesh to train {config.name}, got none")
         chosen = torch.randint(len(self._vertices), (config.part_points,), generator=generator).to(self._vertices.device)
         vertices, weights = self._vertices[chosen], self._vertex_weights[chosen]
         posed = torch.stack([skin(vertices, weights, transforms) for transforms in bone_transforms])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -46,6 +46,10 @@ class PointwiseSystem(System):
     """
 
     conditions: ClassVar[tuple[str, ...]] = ("global", "none")
+    lower: Tensor
+    upper: Tensor
+    reach: Tensor
+    _joints: Tensor
 
     def __init__(
         self,
@@ -106,6 +110,8 @@ class PosedNetwork(nn.Module):
         starts_at_zero: whether the output is zero, nearly, before training.
     """
 
+    scale: Tensor
+
     def __init__(self, pose_size: int, outputs: int, config: AvatarConfig, scale: float, starts_at_zero: bool) -> None:
         super().__init__()
         sizes = [3 + pose_size] + [config.skinning.width] * config.skinning.depth + [outputs]
@@ -114,16 +120,18 @@ class PosedNetwork(nn.Module):
             nn.init.normal_(layers[-1].weight, 0, 1e-4)
             nn.init.zeros_(layers[-1].bias)
         if config.skinning.weight_norm:
-            layers = [nn.utils.parametrizations.weight_norm(layer) for layer in layers]
+            for layer in layers:
+                nn.utils.parametrizations.weight_norm(layer)
             if starts_at_zero:  # small by its length alone: the first step would turn a short direction to anywhere
                 with torch.no_grad():
-                    layers[-1].parametrizations.weight.original1.mul_(1e4 / config.skinning.width**0.5)
+                    direction = layers[-1].get_parameter("parametrizations.weight.original1")
+                    direction.mul_(1e4 / config.skinning.width**0.5)
         self.layers = nn.ModuleList(layers)
         self.register_buffer("scale", torch.tensor(float(scale)))
 
     def forward(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the outputs [B, N, K] at points [B, N, 3], metres, in poses [B, P]."""
-        first = self.layers[0]
+        first = cast(nn.Linear, self.layers[0])
         weight = first.weight
         h = F.linear(points / self.scale, weight[:, :3]) + F.linear(pose, weight[:, 3:], first.bias)[:, None]
         for layer in self.layers[1:]:

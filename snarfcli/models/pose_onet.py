@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import ClassVar
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from snarfcli.models.pointwise import PointwiseSystem, into_root_frame, move_with_bones
 from snarfcli.models.system import Found
@@ -26,7 +26,7 @@ class PoseONet(PointwiseSystem):
 
     has_canonical_shape: ClassVar[bool] = False
 
-    def _make_shape(self, bones: Tensor) -> nn.Module:
+    def _make_shape(self, bones: Tensor) -> OccupancyNetwork:
         pose_size = 3 * (self.num_bones - 1)
         shape = replace(
             self.config.shape, condition_layer=0, condition_size=pose_size, condition_at_start=True, prior_radius_m=None

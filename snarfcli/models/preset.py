@@ -1,4 +1,4 @@
-"""Skinning weights that a user brings along, from a file."""
+"""Preset skinning weights, read from a file."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def read_preset_weights(path: str | Path, grid: CanonicalGrid, shape: tuple[int,
     for name, last in (("vertices", 3), ("weights", num_bones)):
         if name not in arrays:
             came = ", ".join(sorted(arrays)) or "none"
-            raise UserError(f"weights file {path} must hold the arrays vertices and weights, got {came}")
+            raise UserError(f"weights file {path}: wanted the arrays vertices and weights, got {came}")
         array = arrays[name]
         if array.ndim != 2 or array.shape[1] != last or array.dtype.kind not in "fiu":
-            raise UserError(f"weights file {path}: {name} must be numbers [V, {last}], got {array.dtype} {list(array.shape)}")
+            raise UserError(f"weights file {path}: {name}: wanted numbers [V, {last}], got {array.dtype} {list(array.shape)}")
     vertices, weights = (torch.as_tensor(arrays[name].astype(np.float64)) for name in ("vertices", "weights"))
     try:
         return PresetWeights.from_vertices(vertices, weights, grid, shape)

@@ -31,6 +31,8 @@ class SmplNN(PointwiseSystem):
     keeps_template: ClassVar[bool] = True
     has_skinning_weights: ClassVar[bool] = True
     conditions: ClassVar[tuple[str, ...]] = CONDITIONS
+    vertices: Tensor
+    vertex_weights: Tensor
 
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         if template is None:
@@ -52,10 +54,10 @@ class SmplNN(PointwiseSystem):
 def nearest_vertex(points: Tensor, vertices: Tensor) -> Tensor:
     """Return the number of the nearest of the vertices [V, 3] to each of the points [N, 3], [N]."""
     if points.device.type == "cpu":
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         finite = np.nan_to_num(points.detach().numpy(), posinf=1e6, neginf=-1e6)
-        return torch.from_numpy(cKDTree(vertices.detach().numpy()).query(finite)[1]).long()
+        return torch.from_numpy(KDTree(vertices.detach().numpy()).query(finite)[1]).long()
     parts = points.split(max(1, _PAIRS_AT_ONCE // len(vertices)))
     # By differences: as a matrix product, distances of a centimetre are wrong by millimetres some metres from the origin.
     exact = "donot_use_mm_for_euclid_dist"

@@ -72,7 +72,10 @@ class System(nn.Module):
     has_skinning_weights: ClassVar[bool] = False
     """Whether there are skinning weights of canonical points, so that canonical points can be moved."""
     conditions: ClassVar[tuple[str, ...]] = CONDITIONS
-    """What its canonical shape can be told of the pose."""
+    """Ways in which its canonical shape can depend on the pose."""
+    shape: OccupancyNetwork
+    """The network of the canonical shape."""
+    _joints_of_bones: Tensor
 
     def __init__(self, config: AvatarConfig, skeleton: Skeleton) -> None:
         super().__init__()
@@ -86,7 +89,7 @@ class System(nn.Module):
         self.num_bones = skeleton.num_joints
         self.register_buffer("_joints_of_bones", joints_of_bones(skeleton.parents), persistent=False)
 
-    def _make_shape(self, bones: Tensor) -> nn.Module:
+    def _make_shape(self, bones: Tensor) -> OccupancyNetwork:
         """Return the network that says what is occupied; `bones` [S, 2, 3] are the canonical ends of the bones, metres."""
         shape, condition = self.config.shape, self.config.condition
         if condition.layer is not None:

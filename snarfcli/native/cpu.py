@@ -1,4 +1,4 @@
-"""The CPU library's functions on tensors: what csrc/include/snarf/api.h declares, without the pointers."""
+"""The functions of the CPU library (csrc/include/snarf/api.h) on tensors."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class _Blending(Structure):
 def blend(weights: Tensor, bones: Tensor, active: Tensor | None) -> Tensor:
     """Blend bone transforms [B, J, 12] with the weights [D, H, W, J] of the grid's nodes to [B, D * H * W, 12].
 
-    With `active` [D-1, H-1, W-1] only the corners of these cells are blended; other nodes get zeros.
+    With `active` [D-1, H-1, W-1] only corners of these cells are blended; other nodes get zeros.
     """
     weights, bones, active = _blending_inputs(weights, bones, active)
     out = weights.new_empty(len(bones), weights[..., 0].numel(), 12)
@@ -78,7 +78,7 @@ def blend(weights: Tensor, bones: Tensor, active: Tensor | None) -> Tensor:
 def blend_backward(
     gradient: Tensor, weights: Tensor, bones: Tensor, active: Tensor | None, wants: tuple[bool, bool]
 ) -> tuple[Tensor, Tensor]:
-    """Return the gradients by the weights and by the bones from that by `blend`'s result; empty where not wanted."""
+    """Return the gradients by the weights and by the bones, given that by `blend`'s result; empty if not wanted."""
     gradient = gradient.contiguous()
     weights, bones, active = _blending_inputs(weights, bones, active)
     v_weights = torch.empty_like(weights) if wants[0] else weights.new_empty(0)

@@ -1,7 +1,7 @@
-"""The correspondence searches and their gradient on a GPU: which kernels of csrc/cuda run when, and on what memory.
+"""The correspondence searches and their gradient on a GPU: the order of the kernels of csrc/cuda, and their memory.
 
-Everything runs on PyTorch's current stream. With a `capacity` nothing waits for the device, so that a search can be part of a
-CUDA graph (run it once before the capture, to load the kernels); without one the host waits once, for the number of roots.
+All kernels run on PyTorch's current stream. With a `capacity` nothing waits for the device, so that a search can be part of a
+CUDA graph (run it once before the capture, to load the kernels). Without one the host waits once, for the number of roots.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.native.cuda_compile import cache_folder, nvrtc_version
-from snarfcli.native.cuda_driver import Launcher, gpu
+from snarfcli.native.cuda_driver import KernelLauncher, gpu
 
 __all__ = [
     "broyden_search",
@@ -27,14 +27,14 @@ __all__ = [
 ]
 
 _RECORD_NUMBERS = 76  # of one cell: polynomial and bounds (csrc/cuda/complete.cu)
-_GROUP_BYTES = 1 << 28  # most memory for the records of cells that are searched together
+_GROUP_BYTES = 1 << 28  # maximum memory for the records of cells that are searched together
 _MOST_POSES = 65_535  # of a group: blocks of a grid along y
 _MOST_BINS = 1 << 20  # of a pose; a bin costs about as much as a query
 _FEWEST_BINS = 64
 _THREADS = 128
 _CURVED_THREADS = 64
-_QUERY_BLOCKS = 256  # that measure the queries: more would only queue for the same few atomics
-_CURVED_BLOCKS = 1024  # of a pose; they take turns
+_QUERY_BLOCKS = 256  # blocks that measure the queries; more would only queue for the same few atomics
+_CURVED_BLOCKS = 1024  # per pose; each works on several cells in turn
 _SAME_ROOT = 5e-3  # kSameRoot and kSameBroydenRoot of csrc/include/snarf/search.h
 _SAME_BROYDEN_ROOT = 5e-2
 _LIMIT = 2**31
@@ -83,8 +83,8 @@ def complete_search(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Find the roots of T(x) [x; 1] = x' in every active cell; see `ops.complete_search` for arguments and results.
 
-    The results do not depend on how the work was spread over the device: the same input gives the same bits. Of more roots
-    than `capacity`, which ones are returned is not determined.
+    The results do not depend on how the work was divided on the device: the same input gives the same bits. If there are more
+    roots than `capacity`, it is not determined which of them are returned.
 
     Raises:
         ValueError: 2^31 queries or cells, or more.
@@ -109,7 +109,7 @@ def broyden_search(
     orientation_preserving: bool,
     capacity: int | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Run Broyden's method from every start; see `ops.broyden_search`. What `complete_search` says holds here too."""
+    """Run Broyden's method from every start; see `ops.broyden_search`. Determinism and errors as in `complete_search`."""
     with torch.cuda.device(points.device):
         settings = (tolerance, divergence, max_steps, exact_jacobian, orientation_preserving, capacity)
         return run_broyden(gpu(points), points, transforms, starts, lower, upper, shape, *settings)
@@ -130,7 +130,7 @@ def implicit_backward(
 ) -> tuple[Tensor, Tensor]:
     """Return the gradients by the queries and by the transforms; see `ops.implicit_backward`.
 
-    The former is the same every time; the latter is summed by atomics, in an order and so with last bits that vary.
+    The first is deterministic. The second is summed by atomics in an order that varies, and so do its last bits.
     """
     with torch.cuda.device(gradient.device):
         wants = (wants_points, wants_transforms)
@@ -140,7 +140,7 @@ def implicit_backward(
 
 
 def cuda_status() -> str:
-    """Return in one line whether the CUDA kernels can run here, with what, or why not. Never raises."""
+    """Return one line that states whether the CUDA kernels can run here, and on what, or why not. Never raises."""
     if not torch.version.cuda:
         return "not available: this PyTorch is built without CUDA"
     if not torch.cuda.is_available():
@@ -154,7 +154,7 @@ def cuda_status() -> str:
 
 # ---------------------------------------------------------------- launches
 def run_complete(
-    launcher: Launcher,
+    launcher: KernelLauncher,
     points: Tensor,
     transforms: Tensor,
     lower: Tensor,
@@ -194,12 +194,12 @@ def run_complete(
     return _gather(launcher, points, arguments, capacity, find)
 
 
-def _search_group(launcher: Launcher, points: Tensor, arguments: _Search, poses: int) -> None:
-    """Find the roots of `poses` poses in the cells that the arguments name."""
+def _search_group(launcher: KernelLauncher, points: Tensor, arguments: _Search, poses: int) -> None:
+    """Find the roots of `poses` poses in the cells named by the arguments."""
     count, cells, bins = points.shape[1], arguments.cells, arguments.bins
     threads, curved_threads = launcher.threads(_THREADS), launcher.threads(_CURVED_THREADS)
     whole = {"dtype": torch.int32, "device": points.device}
-    # Everything that starts at zero is one buffer, filled by one kernel.
+    # All that starts at zero is one buffer, filled by one kernel.
     region, listed, bin_count = torch.zeros(poses * (14 + bins), **whole).split([12 * poses, 2 * poses, poses * bins])
     bin_end, cell_list = torch.empty_like(bin_count), torch.empty(poses * cells, **whole)
     records = points.new_empty(poses * cells, _RECORD_NUMBERS)
@@ -220,7 +220,7 @@ def _search_group(launcher: Launcher, points: Tensor, arguments: _Search, poses:
 
 
 def run_broyden(
-    launcher: Launcher,
+    launcher: KernelLauncher,
     points: Tensor,
     transforms: Tensor,
     starts: Tensor,
@@ -258,9 +258,9 @@ def run_broyden(
 
 
 def _gather(
-    launcher: Launcher, points: Tensor, arguments: _Search, capacity: int | None, find: Callable[[], None]
+    launcher: KernelLauncher, points: Tensor, arguments: _Search, capacity: int | None, find: Callable[[], None]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Let `find` report roots, and return them in order."""
+    """Call `find`, which reports roots, and return them ordered by query."""
     queries = points.shape[0] * points.shape[1]
     threads = launcher.threads(_THREADS)
     whole = {"dtype": torch.int32, "device": points.device}
@@ -293,17 +293,17 @@ def _gather(
 
 
 def _first_guess(queries: int) -> int:
-    """Return how many roots there may be; should there be more, the search is done again."""
+    """Return a guess of the number of roots; if there are more, the search is repeated."""
     return queries + min(queries, 1 << 20) + 1024
 
 
 def _slots_for(capacity: int) -> int:
-    """Return room for as many roots as wanted, of which neighbouring cells report some twice."""
+    """Return the number of slots for `capacity` roots, some of which neighbouring cells report twice."""
     return capacity + capacity // 4 + 1024
 
 
 def run_backward(
-    launcher: Launcher,
+    launcher: KernelLauncher,
     gradient: Tensor,
     canonical: Tensor,
     query: Tensor,
@@ -350,19 +350,19 @@ def _blocks(items: int, threads: int) -> int:
 
 
 def _aligned(tensor: Tensor) -> Tensor:
-    """Return the tensor contiguous and on a 16-byte boundary, as the kernels read it."""
+    """Return the tensor contiguous and aligned to 16 bytes, as the kernels need it."""
     tensor = tensor.contiguous()
     return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
 
 def _unfilled(points: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return results to be written to: canonical, query, jacobian_inverse, and the number of roots."""
+    """Return uninitialised results: canonical, query, jacobian_inverse, and the number of roots."""
     long = {"dtype": torch.long, "device": points.device}
     return points.new_empty(rows, 3), torch.empty(rows, **long), points.new_empty(rows, 3, 3), torch.empty(1, **long)
 
 
 def _padding(points: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return results without a root: query B * N, everything else zero."""
+    """Return results without a root: query B * N, all else zero."""
     canonical, query, jacobian_inverse, found = _unfilled(points, rows)
     return canonical.zero_(), query.fill_(points.shape[0] * points.shape[1]), jacobian_inverse.zero_(), found.zero_()
 
@@ -373,6 +373,6 @@ def _nothing(points: Tensor, capacity: int | None) -> tuple[Tensor, Tensor, Tens
 
 def _check_limits(queries: int, cells: int) -> None:
     if queries >= _LIMIT:
-        raise ValueError(f"points must be fewer than 2^31 on a GPU, got {queries}")
+        raise ValueError(f"points: wanted fewer than 2^31 on a GPU, got {queries}")
     if cells >= _LIMIT:
-        raise ValueError(f"skinning_weights must have fewer than 2^31 grid cells on a GPU, got {cells}")
+        raise ValueError(f"skinning_weights: wanted fewer than 2^31 grid cells on a GPU, got {cells}")

@@ -1,6 +1,7 @@
-"""Compiles the CUDA kernels (csrc/cuda) with NVRTC on first use and keeps the results on disk.
+"""Compile the CUDA kernels (csrc/cuda) with NVRTC on first use and keep the results on disk.
 
-NVRTC comes with PyTorch's CUDA builds, needs neither nvcc nor a driver, and is called through ctypes, as PyTorch itself does.
+NVRTC comes with PyTorch's CUDA builds and needs neither nvcc nor a driver. It is called through ctypes and not through the
+package cuda.bindings: that would be one more dependency, tied to a CUDA version, while this works with the NVRTC of PyTorch.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def load_kernels(source: str, dtype: torch.dtype, architecture: str) -> bytes:
         architecture: as `architecture_for` gives it.
 
     Raises:
-        RuntimeError: NVRTC is missing or refuses the source; the message holds its log.
+        RuntimeError: NVRTC is missing or cannot compile the source; the message contains its log.
     """
     path = cache_folder() / f"{source}-{_NUMBERS[dtype]}-{architecture}-{_key(source, dtype, architecture)}.bin"
     code = _read(path)
@@ -46,7 +47,7 @@ def load_kernels(source: str, dtype: torch.dtype, architecture: str) -> bytes:
 
 
 def compile_kernels(source: str, dtype: torch.dtype, architecture: str) -> bytes:
-    """Compile as `load_kernels` does, past the cache: to a CUBIN for sm_XY, to PTX for compute_XY."""
+    """Compile as `load_kernels` does, without the cache: to a CUBIN for sm_XY, to PTX for compute_XY."""
     nvrtc = _nvrtc()
     options = [f"--gpu-architecture={architecture}", f"-DSNARF_NUMBER={_NUMBERS[dtype]}", *_OPTIONS]
     encoded = [option.encode() for option in options]
@@ -64,13 +65,13 @@ def compile_kernels(source: str, dtype: torch.dtype, architecture: str) -> bytes
 
 
 def architecture_for(capability: tuple[int, int]) -> str:
-    """Return what to compile for on a device of this compute capability.
+    """Return the architecture to compile for on a device of this compute capability.
 
-    Its own machine code, sm_XY; for a device that NVRTC is too old to know, the newest portable code, compute_XY, which the
-    driver finishes.
+    This is its machine code, sm_XY. If NVRTC is too old to know the device, it is the newest portable code, compute_XY, which
+    the driver compiles to machine code.
 
     Raises:
-        RuntimeError: NVRTC is missing or no longer knows so old a device.
+        RuntimeError: NVRTC is missing or no longer supports the device.
     """
     wanted = 10 * capability[0] + capability[1]
     nvrtc, count = _nvrtc(), c_int()
@@ -81,7 +82,7 @@ def architecture_for(capability: tuple[int, int]) -> str:
         return f"sm_{wanted}"
     older = [architecture for architecture in known if architecture < wanted]
     if not older:
-        raise RuntimeError(f"NVRTC {nvrtc_version()} does not know compute capability {capability[0]}.{capability[1]} any more")
+        raise RuntimeError(f"NVRTC {nvrtc_version()} no longer supports compute capability {capability[0]}.{capability[1]}")
     return f"compute_{max(older)}"
 
 
@@ -97,13 +98,13 @@ def nvrtc_version() -> str:
 
 
 def cuda_sources() -> Path:
-    """Return the folder of the sources, with `cuda` and `include` in it: in the package, or beside it in a checkout."""
+    """Return the folder with the sources `cuda` and `include`: in the package, or beside it in a checkout."""
     package = Path(__file__).parents[1]
     return next((folder for folder in (package / "csrc", package.parent / "csrc") if folder.is_dir()), package / "csrc")
 
 
 def cache_folder() -> Path:
-    """Return where compiled kernels are kept: snarf/cuda in the user's cache folder."""
+    """Return the folder of compiled kernels: snarf/cuda in the user's cache folder."""
     home = Path.home()
     fallback = home / "AppData" / "Local" if sys.platform == "win32" else home / ".cache"
     folder = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME")
@@ -112,7 +113,7 @@ def cache_folder() -> Path:
 
 # ---------------------------------------------------------------- cache
 def _key(source: str, dtype: torch.dtype, architecture: str) -> str:
-    """Return a hash of everything that the machine code depends on."""
+    """Return a hash of all that the machine code depends on."""
     digest = hashlib.sha256(repr((source, str(dtype), architecture, _OPTIONS, nvrtc_version())).encode())
     for folder in ("cuda", "include"):
         for path in sorted((cuda_sources() / folder).rglob("*")):
@@ -133,7 +134,7 @@ def _read(path: Path) -> bytes | None:
 
 
 def _write(path: Path, code: bytes) -> None:
-    """Put a file into the cache in one step; a folder that cannot be written to only costs time on the next start."""
+    """Write a file into the cache atomically. If the folder cannot be written to, the next start compiles again."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
@@ -149,7 +150,7 @@ def _write(path: Path, code: bytes) -> None:
 # ---------------------------------------------------------------- NVRTC
 @cache
 def _nvrtc() -> ctypes.CDLL:
-    """Load NVRTC: the one of PyTorch's CUDA version, which suits the driver, if there is a choice."""
+    """Load NVRTC; among several, the one of PyTorch's CUDA version, which fits the driver."""
     tried = []
     for name in _candidates():
         try:
@@ -158,13 +159,13 @@ def _nvrtc() -> ctypes.CDLL:
             tried.append(str(error))
     wanted = f"cu{torch.version.cuda.split('.')[0]}" if torch.version.cuda else "any version"
     raise RuntimeError(
-        f"NVRTC was not found; PyTorch's CUDA builds bring it along, otherwise run "
+        f"NVRTC was not found; PyTorch's CUDA builds contain it, otherwise run "
         f'"pip install nvidia-cuda-nvrtc" ({wanted}); tried: {"; ".join(tried)}'
     )
 
 
 def _candidates() -> list[str]:
-    """Return file names under which NVRTC may be found, the most suitable first."""
+    """Return file names of NVRTC to try, the most suitable first."""
     major = torch.version.cuda.split(".")[0] if torch.version.cuda else ""
     pattern = "nvrtc64_*_0.dll" if sys.platform == "win32" else "libnvrtc.so.*"
     wheels = importlib.util.find_spec("nvidia")
@@ -187,7 +188,7 @@ def _check(code: int) -> None:
 
 
 def _text(program: c_void_p, function: str) -> bytes:
-    """Return what NVRTC has to say about a program, by the name of the function that copies it."""
+    """Return a text or code that NVRTC holds for a program, by the name of the function that copies it."""
     size = c_size_t()
     _check(getattr(_nvrtc(), f"{function}Size")(program, byref(size)))
     buffer = ctypes.create_string_buffer(size.value)

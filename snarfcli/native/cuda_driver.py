@@ -1,4 +1,8 @@
-"""Runs compiled kernels on a GPU through the CUDA driver, on PyTorch's current stream."""
+"""Run compiled kernels on a GPU through the CUDA driver, on PyTorch's current stream.
+
+The driver is called through ctypes and not through the package cuda.bindings: that would be one more dependency, tied to a CUDA
+version, and eight functions of the driver are enough.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +17,22 @@ import torch
 
 from snarfcli.native.cuda_compile import architecture_for, load_kernels
 
-__all__ = ["Gpu", "Launcher", "gpu"]
+__all__ = ["Gpu", "KernelLauncher", "gpu"]
 
 
-class Launcher(Protocol):
-    """What runs kernels: a GPU, or the tests' emulation of one."""
+class KernelLauncher(Protocol):
+    """Interface that runs kernels: implemented by a GPU, and by the tests' emulation of one."""
 
     def threads(self, most: int) -> int:
-        """Return how many threads a block gets, at most `most`."""
+        """Return the number of threads per block, at most `most`."""
+        ...
 
     def launch(self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure) -> None:
-        """Run a kernel of csrc/cuda/<source>.cu with one structure as its argument, after everything launched before."""
+        """Run a kernel of csrc/cuda/<source>.cu with one structure as its argument, after all earlier launches."""
 
 
 class Gpu:
-    """One device, and the kernels for one type of numbers that are loaded on it."""
+    """One device with the loaded kernels for one dtype."""
 
     def __init__(self, device: torch.device, dtype: torch.dtype) -> None:
         self.dtype = dtype
@@ -53,7 +58,7 @@ class Gpu:
         _check(_driver().cuLaunchKernel(function, *size, c_uint(0), stream, parameters, None))
 
     def _function(self, source: str, kernel: str) -> c_void_p:
-        # A thread of autograd may not have a context yet; inside torch.cuda.device() this is the one that it would get.
+        # A thread of autograd may have no context yet; inside torch.cuda.device() it would get this one.
         _check(_driver().cuCtxSetCurrent(self._context))
         function = self._functions.get((source, kernel))
         if function is None:
@@ -69,7 +74,7 @@ class Gpu:
 
 
 def gpu(tensor: torch.Tensor) -> Gpu:
-    """Return the launcher for the device and the type of `tensor`."""
+    """Return the launcher for the device and dtype of `tensor`."""
     return _gpu(tensor.device.index, tensor.dtype)
 
 

@@ -21,7 +21,7 @@ __all__ = [
 ]
 
 ABI_VERSION = 2
-"""Version of the C interface (csrc/include/snarf/api.h) that this code speaks."""
+"""Version of the C interface (csrc/include/snarf/api.h) that this code uses."""
 
 _ENDINGS = {"darwin": "dylib", "win32": "dll"}
 _FILE_NAME = f"libsnarf_native.{_ENDINGS.get(sys.platform, 'so')}"
@@ -30,9 +30,9 @@ _COMPILERS = "Debian and Ubuntu: apt install g++; macOS: xcode-select --install;
 
 
 def native_library() -> ctypes.CDLL | None:
-    """Return the native library, loaded on the first call, or None; `why_unavailable` then tells the reason. Never raises.
+    """Return the native library, loaded on the first call, or None; then `why_unavailable` states the reason. Never raises.
 
-    The environment variable SNARF_NATIVE_LIBRARY names another file than the installed one.
+    The environment variable SNARF_NATIVE_LIBRARY replaces the installed file by another.
     """
     return _load()[0]
 
@@ -58,7 +58,7 @@ def instruction_set() -> str | None:
 
 
 def build_note() -> dict[str, Any]:
-    """Return what the build noted: `built`, and `compiler` and `instruction_sets`, or the `reason` why not; or nothing."""
+    """Return the note of the build: `built`, and `compiler` and `instruction_sets` or the `reason`; empty without a note."""
     for folder in _folders():
         try:
             note = json.loads((folder / "native_build.json").read_text(encoding="utf-8"))
@@ -79,18 +79,18 @@ def _load() -> tuple[ctypes.CDLL | None, Path | None, str | None]:
         _check_version(library, path)
     except _Unavailable as error:
         return None, None, str(error)
-    except Exception as error:  # whatever is wrong with the file, the reference works
+    except Exception as error:  # any damage of the file: the reference still works
         reason = " ".join(str(error).split()) or type(error).__name__
         return None, None, f"the native library cannot be loaded: {reason}; reinstall snarf"
     return library, path, None
 
 
 class _Unavailable(Exception):
-    """Why there is no library, and what to do."""
+    """There is no library; the message states the reason and the next step."""
 
 
 def _folders() -> list[Path]:
-    """Return where an installation puts the library: beside this file, or, where that is in a checkout, in site-packages."""
+    """Return the folders of an installation: that of this file and, if this file is in a checkout, that in site-packages."""
     own = Path(__file__).parent
     package = sys.modules.get(__package__ or "")
     return list(dict.fromkeys([own, *map(Path, getattr(package, "__path__", ()))]))
@@ -102,7 +102,7 @@ def _find() -> Path:
     if named:
         path = Path(named).absolute()
         if not path.is_file():
-            raise _Unavailable(f"{_VARIABLE} names {named}, which is no file; correct or unset it")
+            raise _Unavailable(f"{_VARIABLE} names {named}, which is not a file; correct or unset it")
         return path
     for folder in _folders():
         if (folder / _FILE_NAME).is_file():
@@ -117,9 +117,9 @@ def _find() -> Path:
 
 
 def _check_whole(path: Path) -> None:
-    """Refuse an ELF file that ends before its segments do: loading it would end the process with a bus error.
+    """Raise for an ELF file that ends before its segments do: loading it would end the process with a bus error.
 
-    Other systems' loaders check this themselves. Offsets are those of the 64-bit ELF header (System V ABI, chapter 4).
+    The loaders of other systems check this. Offsets are those of the 64-bit ELF header (System V ABI, chapter 4).
     """
     with open(path, "rb") as file:
         head = file.read(64)
@@ -138,12 +138,12 @@ def _check_whole(path: Path) -> None:
 
 
 def _check_version(library: ctypes.CDLL, path: Path) -> None:
-    """Refuse a library with another interface than this code speaks."""
+    """Raise for a library whose interface has another version."""
     try:
         function = library.snarf_abi_version
     except AttributeError:
-        raise _Unavailable(f"{path} is no library of snarf") from None
+        raise _Unavailable(f"{path} is not a library of snarf") from None
     function.argtypes, function.restype = (), ctypes.c_int
     version = function()
     if version != ABI_VERSION:
-        raise _Unavailable(f"{path} has version {version} of the interface, wanted {ABI_VERSION}; reinstall snarf")
+        raise _Unavailable(f"{path}: wanted version {ABI_VERSION} of the interface, got {version}; reinstall snarf")

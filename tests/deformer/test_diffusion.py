@@ -85,14 +85,14 @@ def test_preset_weights_are_kept_in_the_state_and_not_trained():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v, w: (v[:, :2], w), r"vertices must have shape \[V, 3\]"),
+        (lambda v, w: (v[:, :2], w), r"vertices: wanted shape \[V, 3\]"),
         (lambda v, w: (v[:0], w[:0]), "at least one"),
-        (lambda v, w: (v, w[1:]), r"weights must have shape \[50, J\]"),
-        (lambda v, w: (v * torch.nan, w), "vertices must be finite"),
-        (lambda v, w: (v, w / 0), "weights must be finite"),
-        (lambda v, w: (v, 2 * w - 1 / 3), "weights must not be negative"),
-        (lambda v, w: (v, 0.9 * w), "weights must sum to 1 for each vertex, got sums from 0.9 to 0.9"),
-        (lambda v, w: (v + 1, w), "vertices must lie in the canonical box .* of 50 outside"),
+        (lambda v, w: (v, w[1:]), r"weights: wanted shape \[50, J\]"),
+        (lambda v, w: (v * torch.nan, w), "vertices: wanted finite"),
+        (lambda v, w: (v, w / 0), "weights: wanted finite"),
+        (lambda v, w: (v, 2 * w - 1 / 3), "weights: wanted 0 or more"),
+        (lambda v, w: (v, 0.9 * w), "weights: wanted a sum of 1 per vertex, got sums from 0.9 to 0.9"),
+        (lambda v, w: (v + 1, w), "vertices: wanted all in the canonical box .* of 50 outside"),
     ],
 )
 def test_what_cannot_be_used_is_refused(change, message):

@@ -63,7 +63,7 @@ def test_forward_map_and_its_jacobian_against_autograd():
 
 
 def test_a_box_turned_inside_out_is_refused():
-    with pytest.raises(ValueError, match=r"grid\.upper must exceed grid\.lower"):
+    with pytest.raises(ValueError, match=r"grid\.upper: wanted more than grid\.lower"):
         CanonicalGrid(torch.zeros(3), torch.tensor([1.0, 0.0, 1.0]))
-    with pytest.raises(ValueError, match=r"grid\.lower must have shape \[3\], got \[2\]"):
+    with pytest.raises(ValueError, match=r"grid\.lower: wanted shape \[3\], got \[2\]"):
         CanonicalGrid(torch.zeros(2), torch.ones(3))

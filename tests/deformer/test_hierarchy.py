@@ -109,7 +109,7 @@ def test_branches_compete_only_where_they_part():
         ([], "at least one joint"),
         ([0], "cycle at or above joint 0"),
         ([-1, 2, 1], "cycle at or above joint 1"),
-        ([-1, 5], "must lie below 2, got 5"),
+        ([-1, 5], "wanted numbers below 2, got 5"),
     ],
 )
 def test_what_is_no_tree_is_refused(parents, message):
@@ -119,9 +119,9 @@ def test_what_is_no_tree_is_refused(parents, message):
 
 def test_choices_are_named():
     assert isinstance(make_softmax("plain", 3), PlainSoftmax)
-    with pytest.raises(ValueError, match=r"skinning.softmax must be one of plain, hierarchical, got 'soft'"):
+    with pytest.raises(ValueError, match=r"skinning.softmax: wanted plain or hierarchical, got 'soft'"):
         make_softmax("soft", 3)
-    with pytest.raises(ValueError, match="needs parents"):
+    with pytest.raises(ValueError, match="parents: wanted the parent of each bone"):
         make_softmax("hierarchical", 3)
     with pytest.raises(ValueError, match="each of the 3 bones, got 2"):
         make_softmax("hierarchical", 3, [-1, 0])

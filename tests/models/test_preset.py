@@ -32,12 +32,12 @@ def test_weights_of_the_file_are_those_of_the_field(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"weights": None}, "must hold the arrays vertices and weights, got vertices$"),
-        ({"weights": np.ones((5, 3))}, r"weights must be numbers \[V, 2\], got float64 \[5, 3\]"),
-        ({"vertices": np.array([["a", "b", "c"]])}, r"vertices must be numbers \[V, 3\], got <U1"),
-        ({"weights": np.ones((4, 2)) / 2}, r"weights must have shape \[\d+, J\]"),
-        ({"vertices": 5 + arrays()["vertices"]}, "vertices must lie in the canonical box"),
-        ({"weights": 2 * arrays()["weights"]}, "must sum to 1"),
+        ({"weights": None}, "wanted the arrays vertices and weights, got vertices$"),
+        ({"weights": np.ones((5, 3))}, r"weights: wanted numbers \[V, 2\], got float64 \[5, 3\]"),
+        ({"vertices": np.array([["a", "b", "c"]])}, r"vertices: wanted numbers \[V, 3\], got <U1"),
+        ({"weights": np.ones((4, 2)) / 2}, r"weights: wanted shape \[\d+, J\]"),
+        ({"vertices": 5 + arrays()["vertices"]}, "vertices: wanted all in the canonical box"),
+        ({"weights": 2 * arrays()["weights"]}, "wanted a sum of 1"),
     ],
 )
 def test_a_file_that_does_not_fit_ends_in_one_line(tmp_path, changes, message):

@@ -388,7 +388,7 @@ def test_strides_and_addresses_do_not_matter(runner):
 
 def test_too_many_queries_are_refused():
     points = torch.empty(1, 1, 3).expand(2**16, 2**15, 3)
-    with pytest.raises(ValueError, match="points must be fewer than 2"):
+    with pytest.raises(ValueError, match="points: wanted fewer than 2"):
         cuda._check_limits(points.shape[0] * points.shape[1], 1)
     with pytest.raises(ValueError, match=r"fewer than 2.31 grid cells"):
         cuda._check_limits(1, 2**31)

@@ -108,7 +108,7 @@ def test_the_variable_names_another_library(fresh, tmp_path):
 def test_a_wrong_variable_is_named(fresh):
     fresh.setenv("SNARF_NATIVE_LIBRARY", "/nowhere/lib.so")
     assert library.native_library() is None
-    assert library.why_unavailable() == "SNARF_NATIVE_LIBRARY names /nowhere/lib.so, which is no file; correct or unset it"
+    assert library.why_unavailable() == "SNARF_NATIVE_LIBRARY names /nowhere/lib.so, which is not a file; correct or unset it"
 
 
 @pytest.mark.parametrize("size", [0, 63, 64, 200, 5_000, 50_000])
@@ -132,10 +132,10 @@ def test_a_library_of_somebody_else_is_a_reason(fresh):
     import numpy.fft._pocketfft_umath as other
 
     fresh.setenv("SNARF_NATIVE_LIBRARY", other.__file__)
-    assert library.why_unavailable() == f"{other.__file__} is no library of snarf"
+    assert library.why_unavailable() == f"{other.__file__} is not a library of snarf"
 
 
 def test_another_version_of_the_interface_is_a_reason(fresh):
     fresh.setattr(library, "ABI_VERSION", library.ABI_VERSION + 1)
     reason = library.why_unavailable()
-    assert f"has version {library.ABI_VERSION - 1} of the interface, wanted {library.ABI_VERSION}; reinstall snarf" in reason
+    assert f"wanted version {library.ABI_VERSION} of the interface, got {library.ABI_VERSION - 1}; reinstall snarf" in reason

@@ -1,4 +1,4 @@
-"""`snarf animate`: meshes and a video of an avatar in motion."""
+"""`snarf animate`: write posed meshes and a video of an avatar in motion."""
 
 from __future__ import annotations
 
@@ -45,19 +45,19 @@ __all__ = ["AnimateConfig", "run"]
 
 log = logging.getLogger(__name__)
 
-_RESOLUTIONS = (16, 1024)  # dense lattices: 1024 take some 4 GB for a body with its arms spread
+_RESOLUTIONS = (16, 1024)  # dense lattices: 1024 takes about 4 GB for a body with spread arms
 _LARGEST_PICTURE = 4096
-_TRUE_FRAMES, _TRUE_POINTS = 16, 300  # of the truth, so that all of it is in the picture
+_TRUE_FRAMES, _TRUE_POINTS = 16, 300  # sampled from the ground truth, so that the camera shows all of it
 
 
 def run(config: AnimateConfig) -> int:
-    """Write a mesh a frame, a video and `animation.json`; an interrupted run goes on where it stopped.
+    """Write one mesh per frame, a video and `animation.json`; an interrupted run continues where it stopped.
 
     Returns:
         0, or 1 if some frames have no surface.
 
     Raises:
-        UserError: there is no avatar or no motion, or a setting cannot be used.
+        UserError: the avatar or the motion does not exist, or a setting cannot be used.
     """
     plan = _check(config)
     avatar, path = load_selected_avatar(config)
@@ -73,7 +73,7 @@ def run(config: AnimateConfig) -> int:
     settings = frame_settings(config, path, chosen)
     prepare_folder(folder, settings, config.overwrite)
     log.info("avatar: %s, on %s", path, avatar.device)
-    log.info("motion: %s, %d frames at %g a second", motion.name, motion.num_frames, motion.frame_rate)
+    log.info("motion: %s, %d frames at %g per second", motion.name, motion.num_frames, motion.frame_rate)
 
     start = time.perf_counter()
     canonical = _canonical(config, avatar)
@@ -106,7 +106,7 @@ def run(config: AnimateConfig) -> int:
                 pass
     except KeyboardInterrupt:
         done = len(animation.frames)
-        log.info("stopped after %d of %d frames; the same command goes on from there", done, count)
+        log.info("stopped after %d of %d frames; run the same command to continue", done, count)
         raise
     record = _record(config, animation, motion, path, processes, time.perf_counter() - start)
     write_json(folder / RECORD, {"complete": True, "settings": settings, **record})
@@ -115,7 +115,7 @@ def run(config: AnimateConfig) -> int:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Settings of pictures and processes, read."""
+    """Parsed settings of pictures and processes."""
 
     size: tuple[int, int]
     views: tuple[View, ...]
@@ -124,7 +124,7 @@ class _Plan:
 
 
 def _check(config: AnimateConfig) -> _Plan:
-    """Refuse settings that cannot be used, before any work starts."""
+    """Check all settings before any work starts."""
     for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("camera", CAMERAS)):
         check_choice(name, getattr(config, name), choices)
     check_motion_selection(config)
@@ -133,7 +133,7 @@ def _check(config: AnimateConfig) -> _Plan:
     check_number("azimuth_deg", config.azimuth_deg, -360, 360)
     check_number("elevation_deg", config.elevation_deg, -89, 89)
     if not (config.meshes or config.video):
-        raise UserError("nothing to make: both meshes and video are false")
+        raise UserError("meshes, video: wanted at least one, got false for both; set one to true")
     size = re.fullmatch(r"\s*(\d+)(?:\s*x\s*(\d+))?\s*", config.video_size)
     numbers = (int(size[1]), int(size[2] or size[1])) if size else (0, 0)
     if not all(16 <= pixels <= _LARGEST_PICTURE for pixels in numbers):
@@ -142,9 +142,9 @@ def _check(config: AnimateConfig) -> _Plan:
     for name in config.beside:
         check_choice("beside", name, CONTENTS)
         if name == config.surface:
-            raise UserError(f"beside=[{name}]: the avatar is shown as surface={name} already; take the other one")
+            raise UserError(f"beside=[{name}]: surface={name} shows this already; give the other surface")
         if config.beside.count(name) > 1:
-            raise UserError(f"beside has '{name}' twice; name each once")
+            raise UserError(f"beside: wanted each panel once, got '{name}' twice; leave one out")
     picture_size(numbers, 1 + len(config.beside), len(views))
     return _Plan(numbers, views, parse_turntable(config.turntable), parse_processes(config.processes))
 
@@ -157,7 +157,7 @@ def _screen(
     canonical: Mesh | None,
     truth: GroundTruthMeshes | None,
 ) -> Screen:
-    """Set the stage for a motion."""
+    """Return the panels of the video: cameras and floor for the whole motion."""
     motion = chosen.motion
     points = body_points(avatar, motion.poses, motion.translation, canonical, chosen.bone_transforms)
     also = beside = None
@@ -185,16 +185,17 @@ def _screen(
     return Screen(stage, plan.size, contents, settled=["canonical"])
 
 
-def _with_poster(pictures: Iterator[np.ndarray], index: int, path: Path) -> Iterator[np.ndarray]:
-    """Pass pictures on, and write one of them as PNG."""
+def _with_poster(pictures: Iterator[np.ndarray | None], index: int, path: Path) -> Iterator[np.ndarray]:
+    """Yield the pictures, and write the one with number `index` as PNG."""
     for number, picture in enumerate(pictures):
+        assert picture is not None  # pictures are drawn whenever there is a video
         if number == index:
             write_png(path, picture)
         yield picture
 
 
 def _check_system(config: AnimateConfig, avatar: Avatar) -> None:
-    """Refuse what needs skinning weights of an avatar without any."""
+    """Reject settings that need skinning weights for an avatar without them."""
     if avatar.has_skinning_weights:
         return
     needing = [f"beside=[{name}]" for name in config.beside if name in ("canonical", "skinned", "weights")]
@@ -206,17 +207,17 @@ def _check_system(config: AnimateConfig, avatar: Avatar) -> None:
     if wanted:
         raise UserError(
             f"{wanted} needs skinning weights of canonical points, which model {avatar.config.model.name} does not have; "
-            "leave it out, or take an avatar of model=fast_snarf"
+            "leave it out, or use an avatar of model=fast_snarf"
         )
 
 
 def _canonical(config: AnimateConfig, avatar: Avatar) -> Mesh | None:
-    """Return a canonical mesh of the body, for colours and cameras; None without need or if there is none."""
+    """Return a canonical mesh for colours and cameras; None if it is not needed or the surface is empty."""
     if not (config.video or config.weight_colors) or not avatar.has_skinning_weights:
         return None
     try:
         if config.weight_colors or config.surface == "skinned" or {"skinned", "canonical", "weights"} & set(config.beside):
-            # Made here, the avatar remembers it, and takes it along to worker processes.
+            # The avatar caches it, and is pickled with it for worker processes.
             return avatar.skinned_surface(config.resolution, config.keep_share).mesh
         return canonical_surface(avatar, avatar.skeleton.canonical_pose.float(), min(64, config.resolution))
     except (EmptySurface, FullSurface):
@@ -226,7 +227,7 @@ def _canonical(config: AnimateConfig, avatar: Avatar) -> Mesh | None:
 def _record(
     config: AnimateConfig, animation: Animation, motion: Motion, avatar: Path, processes: int, seconds: float
 ) -> dict[str, Any]:
-    """Return the facts for `animation.json`."""
+    """Return the content of `animation.json`."""
     frames = animation.frames
     return {
         "config": asdict(config),
@@ -249,24 +250,24 @@ def _record(
 
 
 def _report(config: AnimateConfig, animation: Animation, timings: dict[str, float]) -> int:
-    """Say what was made and where it is, and return the exit code."""
+    """Print what was written and where, and return the exit code."""
     frames, folder = animation.frames, animation.folder
     skipped = sum(frame.problem is not None for frame in frames)
     kept = sum(frame.was_there for frame in frames)
     log.info(
-        "%d frames in %.1f s, %.2f frames a second%s",
-        len(frames), timings["total_s"], timings["frames_a_second"], f"; {kept} were there already" if kept else "",
+        "%d frames in %.1f s, %.2f frames per second%s",
+        len(frames), timings["total_s"], timings["frames_a_second"], f"; {kept} existed already" if kept else "",
     )  # fmt: skip
     if config.meshes and skipped < len(frames):
         log.info("meshes: %s", folder / f"frame_*.{config.format}")
     if config.video:
-        log.info("video: %s, and its middle as %s", folder / VIDEO, POSTER)
+        log.info("video: %s, its middle frame: %s", folder / VIDEO, POSTER)
     pieces = sum(frame.components > 1 for frame in frames)
     if pieces:
-        log.info("%d frames have loose pieces; keep_share=0.1 would drop all but large ones", pieces)
+        log.info("%d frames have loose pieces; keep_share=0.1 removes all but large ones", pieces)
     if skipped:
         log.warning("%d of %d frames have no surface; see %s", skipped, len(frames), folder / RECORD)
     incomplete = sum(bool(frame.missing) for frame in frames)
     if incomplete:
-        log.warning("%d of %d frames lack something beside the avatar; see %s", incomplete, len(frames), folder / RECORD)
+        log.warning("%d of %d frames lack a panel beside the avatar; see %s", incomplete, len(frames), folder / RECORD)
     return 1 if skipped or incomplete else 0

@@ -1,4 +1,4 @@
-"""What can be chosen about `snarf animate`."""
+"""Settings of `snarf animate`."""
 
 from __future__ import annotations
 
@@ -16,45 +16,45 @@ class AnimateConfig(MotionSelection, AvatarSelection):
     """Settings of `snarf animate`."""
 
     pose: str | None = MISSING
-    """Motion: .npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf, or a folder of frames; null for the built-in `motion`."""
+    """Motion file (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf) or folder of frames; null uses `motion`."""
     motion: str | None = MISSING
-    """Without a pose file: a built-in motion of SMPL's joints, or a sequence of the samples of any other skeleton; null for
-    jumping_jacks, or for the held-out sequence."""
+    """Without a pose file: a built-in motion (SMPL) or a sequence of the samples (other skeletons); null for jumping_jacks
+    or the held-out sequence."""
     surface: str = MISSING
-    """field (the union, watertight) or skinned (the canonical mesh moved by its skin)."""
+    """field (extracted from the posed field, watertight) or skinned (the canonical mesh, moved by its skinning weights)."""
     resolution: int = MISSING
-    """Voxels along the longest side: 128, 256, 512 or any number from 16 to 1024."""
+    """Voxels along the longest side, 16 to 1024, such as 128, 256 or 512."""
     keep_share: float = MISSING
-    """Loose pieces with fewer faces than this share of the largest surface's are dropped."""
+    """Remove loose pieces with fewer faces than this share of the faces of the largest piece."""
     meshes: bool = MISSING
-    """Whether to write a mesh a frame."""
+    """Write one mesh per frame."""
     format: str = MISSING
     """Format of the meshes: ply or obj."""
     weight_colors: bool = MISSING
-    """Whether vertices are coloured by their skinning weights."""
+    """Colour vertices by their skinning weights."""
     video: bool = MISSING
-    """Whether to draw a video."""
+    """Write a video."""
     video_size: str = MISSING
-    """Pixels of one panel of the video: 512, or width x height such as 1280x720. Several views or contents make it larger."""
+    """Pixels of one panel of the video: 512, or width x height such as 1280x720. Each view and content is one panel."""
     views: list[str] = MISSING
-    """Sides to look from, side by side: front, left, back, right (of the body), top, or degrees towards the body's left."""
+    """Views, shown side by side: front, left, back, right (of the body), top, or degrees towards the body's left."""
     azimuth_deg: float = MISSING
-    """Degrees by which the cameras of all views but top are turned towards the body's left; 0 takes the views by their word."""
+    """Degrees by which all views except top are turned towards the body's left; 0 uses the named views exactly."""
     elevation_deg: float = MISSING
-    """Degrees that the camera looks down, in all views but top."""
+    """Degrees that the camera looks down, in all views except top."""
     camera: str = MISSING
-    """still (it sees the whole motion) or follow (it goes along with the body)."""
+    """still (shows the whole motion) or follow (moves with the body)."""
     turntable: str = MISSING
-    """Whether the camera goes round the body: false, true (a turn in eight seconds), or degrees a second."""
+    """Turn the camera around the body: false, true (one turn in eight seconds), or degrees per second."""
     beside: list[str] = MISSING
-    """What is shown beside the avatar: canonical (its canonical shape in this pose), truth (the true posed mesh, where there is
-    one), skinned or field (the other surface), weights (the skinned surface, coloured by its weights)."""
+    """Further panels: canonical (canonical shape under this pose), truth (ground-truth mesh, if there is one), skinned or field
+    (the other surface), weights (the skinned surface, coloured by its skinning weights)."""
     output: str | None = MISSING
-    """Folder for the results; null for animation/<motion> beside the avatar."""
+    """Output folder; null for animation/<motion> beside the avatar."""
     overwrite: bool = MISSING
-    """Start again, even over frames made with other settings."""
+    """Start again and replace existing frames, also those of other settings."""
     processes: str = MISSING
-    """Processes that make frames at the same time, sharing the threads: auto (one a core as memory allows) or a number. With a
-    GPU one process extracts all surfaces, and they only draw."""
+    """Number of processes, which share the threads; auto: one per core if memory allows. With a GPU, one process extracts all
+    surfaces and the others only draw."""
     experiment: str | None = None
-    """Name of the preset of settings that the rest starts from; null for none."""
+    """Preset of settings, which other settings override; null for none."""

@@ -1,4 +1,4 @@
-"""The folder that `snarf animate` writes to: kept when the same command goes on, refused to other settings."""
+"""The output folder of `snarf animate`: continued with the same settings, rejected with other settings."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ POSTER = "poster.png"
 
 
 def folder_name(name: str) -> str:
-    """Return a motion's name as a folder's."""
+    """Return the name of a motion as a valid folder name."""
     return names.folder_name(name, "motion")
 
 
 def frame_settings(config: AnimateConfig, avatar: Path, chosen: SelectedMotion) -> dict[str, Any]:
-    """Return what the frames depend on: frames of other settings must not be mixed with them."""
-    # Of the frames, only which the first one is and how far they are apart: more of the same motion can be made later.
+    """Return the settings that the frames depend on. Frames of different settings are never mixed."""
+    # Of the frame range only start and step, so that more frames of the same motion can be added later.
     whole = chosen.whole
     digest = hashlib.sha256(whole.poses.tobytes() + whole.translation.tobytes())
     return {
@@ -45,10 +45,10 @@ def frame_settings(config: AnimateConfig, avatar: Path, chosen: SelectedMotion) 
 
 
 def prepare_folder(folder: Path, settings: dict[str, Any], overwrite: bool) -> None:
-    """Make the folder ready: keep frames of the same settings, refuse others, or start again.
+    """Prepare the folder: keep frames of the same settings, or start again with `overwrite`.
 
     Raises:
-        UserError: it holds other frames, or files of unknown origin, and `overwrite` is false.
+        UserError: it has frames of other settings, or files of unknown origin, and `overwrite` is false.
     """
     record = folder / RECORD
     old = None
@@ -56,18 +56,18 @@ def prepare_folder(folder: Path, settings: dict[str, Any], overwrite: bool) -> N
         content = read_json(record, "record of an animation")
         old = content.get("settings") if isinstance(content, dict) else None
         if not isinstance(old, dict):
-            raise UserError(f"{record} is no record of an animation; give overwrite=true to replace it, or output=FOLDER")
+            raise UserError(f"{record} is not the record of an animation; give overwrite=true to replace it, or output=FOLDER")
     if old is not None:
         changed = [name for name, value in settings.items() if old.get(name) != value]
         if changed:
             what = ", ".join(f"{name} {old.get(name)} (now {settings[name]})" for name in changed if "sha256" not in name)
             what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
-            raise UserError(f"{folder} holds frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
+            raise UserError(f"{folder} has frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
     else:
         there = [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), *folder.glob(VIDEO), *folder.glob(POSTER)]
-        if there and not overwrite:  # without a record they are somebody else's
+        if there and not overwrite:  # without a record their origin is unknown
             raise UserError(
-                f"{folder} holds {there[0].name} of unknown origin; give overwrite=true to replace it, or output=FOLDER"
+                f"{folder} has {there[0].name} of unknown origin; give overwrite=true to replace it, or output=FOLDER"
             )
         for stale in there:
             stale.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""`snarf eval`: IoU of a trained avatar on held-out motion or on out-of-distribution poses."""
+"""`snarf eval`: measure the IoU of a trained avatar on held-out motion or on out-of-distribution poses."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import evaluate
+from snarfcli.evaluation.figure import write_figure
 from snarfcli.evaluation.report import SPLITS, EvaluationReport, metrics_content, table, timings_text
 from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
@@ -39,11 +40,11 @@ class EvalConfig:
     """Settings of `snarf eval`."""
 
     subject: str = MISSING
-    """Whose avatar, such as 50002."""
+    """Subject of the avatar, such as 50002."""
     data: DataConfig = MISSING
-    """Where the samples come from."""
+    """Data set of the samples."""
     search: SearchConfig | None = None
-    """The correspondence search; null for the one that the avatar was trained with."""
+    """Correspondence search; null for the one that the avatar was trained with."""
     data_root: str = MISSING
     """Folder with the processed samples."""
     output_root: str = MISSING
@@ -53,36 +54,36 @@ class EvalConfig:
     split: str = MISSING
     """id (held-out motion) or ood (out-of-distribution poses)."""
     ckpt: str | None = MISSING
-    """Avatar file or run folder to evaluate instead; results go beside it."""
+    """Avatar file or run folder to evaluate instead; results are written beside it."""
     max_frames: int | None = MISSING
-    """Evaluate so many frames, evenly spaced; null for all."""
+    """Number of frames to evaluate, evenly spaced; null for all."""
     points: int | None = MISSING
-    """Evaluate so many points a frame, half uniform, half near the surface; null for all."""
+    """Number of points per frame, half uniform, half near the surface; null for all."""
     surface_frames: int = MISSING
-    """In so many frames the surface is extracted and compared with the true one (Chamfer, normals, F-score); 0: none."""
+    """Number of frames in which the surface is compared with the ground truth (Chamfer, normals, F-score); 0 disables this."""
     surface_resolution: int = MISSING
-    """Voxels along the longest side of those surfaces."""
+    """Voxels along the longest side of these surfaces."""
     figure: bool = MISSING
-    """Whether to draw the worst and the best frames."""
+    """Draw the worst and the best frames."""
     figure_frames: int = MISSING
-    """How many of the worst and how many of the best frames are drawn."""
+    """Number of worst frames, and of best frames, to draw."""
     figure_resolution: int = MISSING
     """Voxels along the longest side of the meshes in the figure."""
     device: str = MISSING
     """auto, cpu, cuda or cuda:N."""
     threads: int | None = MISSING
-    """Threads for tensor work; null leaves PyTorch's choice."""
+    """Threads for tensor work; null keeps PyTorch's choice."""
     seed: int = MISSING
-    """Seed of the choice of points."""
+    """Seed of the selection of points."""
     experiment: str | None = None
-    """Name of the preset of settings that the rest starts from; null for none."""
+    """Preset of settings, which other settings override; null for none."""
 
 
 def run(config: EvalConfig) -> None:
     """Evaluate one avatar: print the table, write `metrics.json` and the figure to `eval_<split>` in the run folder.
 
     Raises:
-        UserError: there is no avatar, there are no samples, they do not go together, or a setting cannot be used.
+        UserError: the avatar or the samples do not exist or do not belong together, or a setting cannot be used.
     """
     _check(config)
     trained_on = config.data.avatars or config.data.name
@@ -138,13 +139,11 @@ def run(config: EvalConfig) -> None:
     weights = measure_weights(avatar, store.template)
     if weights is not None:
         log.info("%s", weights_text(weights))
-    (folder / "frames.png").unlink(missing_ok=True)  # an older figure would not belong to these numbers
+    (folder / "frames.png").unlink(missing_ok=True)  # an older figure does not belong to these numbers
     content = metrics_content(evaluation, {**asdict(config), "avatar": str(path)})
     write_json(folder / "metrics.json", {**content, "surfaces": surfaces, "weights": weights})
     log.info("metrics: %s", folder / "metrics.json")
     if config.figure:
-        from snarfcli.evaluation.figure import write_figure
-
         write_figure(
             folder / "frames.png",
             avatar,
@@ -158,7 +157,7 @@ def run(config: EvalConfig) -> None:
 
 
 def _check(config: EvalConfig) -> None:
-    """Refuse settings that cannot be used, before any work starts."""
+    """Check all settings before any work starts."""
     check_choice("split", config.split, SPLITS)
     least = {
         "max_frames": 1, "points": 2, "surface_frames": 0, "surface_resolution": 16, "figure_frames": 1,
@@ -170,16 +169,16 @@ def _check(config: EvalConfig) -> None:
         check_search(config.search)
     samples = samples_folder(config.data_root, config.data.name, config.subject)
     if config.data.name == "builtin" and not samples.exists():
-        builtin_subject(config.subject)  # says so, and which name is near, if there is no such subject
+        builtin_subject(config.subject)  # raises for an unknown subject, with the most similar name
 
 
 def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None:
-    """Refuse an avatar of another skeleton; say so where it is of another subject or was trained on other data."""
+    """Reject an avatar of another skeleton; warn about another subject or other training data."""
     theirs, ours = avatar.skeleton, store.skeleton
     if theirs.parents != ours.parents:
         raise UserError(
-            f"the avatar has {theirs.num_joints} joints and the samples of subject {store.subject} have {ours.num_joints}, "
-            "or they are joined otherwise; evaluate it on the data that it was trained on"
+            f"wanted samples of the avatar's skeleton ({theirs.num_joints} joints), got another with {ours.num_joints} "
+            f"(subject {store.subject}); evaluate the avatar on the data that it was trained on"
         )
     for name, wanted in (("subject", store.subject), ("data", store.data)):
         trained_on = avatar.facts.get(name)
@@ -188,7 +187,10 @@ def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None
 
 
 def _folder_name(config: EvalConfig, avatar: Avatar) -> str:
-    """Return where the results go; those of another search, data set or subject, or of a part, must not replace the whole."""
+    """Return the name of the output folder.
+
+    Results of another search, data set or subject, or of a part of the points, must not replace the full evaluation.
+    """
     parts = ["eval", config.split]
     if config.search is not None:
         parts.append(config.search.name)
@@ -202,7 +204,7 @@ def _folder_name(config: EvalConfig, avatar: Avatar) -> str:
 
 
 def _check_writable(folder: Path) -> None:
-    """Find out before the work, not after it, that its results cannot be kept."""
+    """Check before the work that the results can be written."""
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
         raise UserError(f"cannot write results to {folder}: {existing} is not a writable folder; copy the run folder")

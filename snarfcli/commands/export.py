@@ -1,4 +1,4 @@
-"""`snarf export`: an avatar as a rigged, animated character for other programs."""
+"""`snarf export`: write an avatar as a rigged, animated character for other programs."""
 
 from __future__ import annotations
 
@@ -47,45 +47,45 @@ class ExportConfig(MotionSelection, AvatarSelection):
     """Settings of `snarf export`."""
 
     pose: list[str] | None = MISSING
-    """Motion files, each a clip: .npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf, or a folder of frames."""
+    """Motion files (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf) or folders of frames; each becomes one clip."""
     motion: list[str] | None = MISSING
-    """Built-in motions of SMPL's joints, or sequences of the samples of any other skeleton, each a clip; with neither these nor
-    pose files there is one clip, jumping_jacks or the held-out sequence."""
+    """Built-in motions (SMPL) or sequences of the samples (other skeletons); each becomes one clip. Without motions and pose
+    files: jumping_jacks or the held-out sequence."""
     format: str = MISSING
-    """glb (mesh, rig, clips and shapes in one file), fbx or usd (the same, through Blender), ply or obj (a mesh a frame)."""
+    """glb (mesh, rig, clips and shapes in one file), fbx or usd (the same, needs Blender), ply or obj (one mesh per frame)."""
     triangles: int | None = MISSING
-    """Most triangles of the mesh; null leaves it as it was extracted."""
+    """Maximum number of triangles; null does not simplify the mesh."""
     influences: int = MISSING
-    """Joints that move one vertex: 4, or 8, which fewer programs read."""
+    """Maximum number of joints per vertex: 4, or 8, which fewer programs read."""
     morph_targets: int = MISSING
-    """Most shapes that are blended for the pose-dependent shape; 0 for one shape, the mean over the clips."""
+    """Maximum number of morph targets for the pose-dependent shape; 0 uses the mean shape over the clips."""
     resolution: int = MISSING
-    """Voxels along the longest side of the canonical box, from which the mesh is made."""
+    """Voxels along the longest side of the canonical box in which the mesh is extracted."""
     weight_colors: bool = MISSING
-    """Whether vertices are coloured by their skinning weights."""
+    """Colour vertices by their skinning weights."""
     height: str = MISSING
-    """How high the clips are: ground (the lowest point of each at y = 0), file (as their motions have it), or auto: built-in
-    motions on the ground, pose files as they are."""
+    """Height of the clips: ground (lowest point of each at y = 0), file (as in the motion), or auto: ground for built-in
+    motions, file for pose files."""
     output: str | None = MISSING
-    """File, or folder for ply and obj; null for export/<subject>.<format> beside the avatar."""
+    """Output file, or folder for ply and obj; null for export/<subject>.<format> beside the avatar."""
     overwrite: bool = MISSING
-    """Whether what is there already is replaced."""
+    """Replace existing output."""
     experiment: str | None = None
-    """Name of the preset of settings that the rest starts from; null for none."""
+    """Preset of settings, which other settings override; null for none."""
 
 
 def run(config: ExportConfig) -> int:
-    """Write the character and a record of it beside it.
+    """Write the character, and a record of the export beside it.
 
     Returns:
-        0, or 1 if the shape could not be followed in some frames.
+        0, or 1 if the shape could not be computed in some frames.
 
     Raises:
-        UserError: there is no avatar or no motion, or a setting cannot be used.
+        UserError: the avatar or a motion does not exist, or a setting cannot be used.
     """
     options = _check(config)
     blender = find_blender() if config.format in BLENDER_FORMATS else []
-    if config.output is not None:  # before anything is loaded; the other place is known once the avatar is
+    if config.output is not None:  # before the avatar is loaded
         _check_place(config, Path(config.output))
     elif config.ckpt is None:
         trained_on = config.data.avatars or config.data.name
@@ -97,10 +97,10 @@ def run(config: ExportConfig) -> int:
     output = _check_place(config, output)
     clips = _clips(config, avatar)
     if config.format == "usd" and len(clips) > 1:
-        raise UserError(f"usd holds one timeline, got {len(clips)} motions; export them one by one, or give format=glb")
+        raise UserError(f"usd: wanted one motion, got {len(clips)}; export them one by one, or give format=glb")
     log.info("avatar: %s, on %s", path, avatar.device)
     for clip in clips:
-        log.info("motion: %s, %d frames at %g a second", clip.motion.name, clip.motion.num_frames, clip.motion.frame_rate)
+        log.info("motion: %s, %d frames at %g per second", clip.motion.name, clip.motion.num_frames, clip.motion.frame_rate)
     start = time.perf_counter()
     write = _write_meshes if config.format in MESH_WRITERS else _write_character
     facts, lines, skipped = write(config, avatar, clips, options, output, blender)
@@ -110,12 +110,12 @@ def run(config: ExportConfig) -> int:
     for line in lines:
         log.info("%s", line)
     for name, frame, reason in skipped:
-        log.warning("clip %s, frame %d: the shape could not be followed: %s", name, frame, reason)
+        log.warning("clip %s, frame %d: the shape could not be computed: %s", name, frame, reason)
     return 1 if skipped else 0
 
 
 def _check(config: ExportConfig) -> CharacterOptions:
-    """Refuse settings that cannot be used, before any work starts; return what the character may cost."""
+    """Check all settings before any work starts; return the options of the character."""
     check_choice("format", config.format, _FORMATS)
     check_choice("height", config.height, HEIGHTS)
     options = CharacterOptions(
@@ -130,43 +130,43 @@ def _check(config: ExportConfig) -> CharacterOptions:
     if config.format in MESH_WRITERS:
         unused = {name: getattr(config, name) for name in ("influences", "morph_targets")}
         given = [f"{name}={value}" for name, value in unused.items() if value != getattr(CharacterOptions, name)]
-        if given:  # a line, no refusal: presets set them whatever the format
-            text = "%s: not used, meshes of format=%s have all weights and their own shape"
+        if given:  # a message, not an error: presets set them for all formats
+            text = "%s: not used with format=%s, whose meshes have all weights and the exact shape"
             log.warning(text, ", ".join(given), config.format)
     return options
 
 
 def _subject(config: ExportConfig, avatar: Avatar) -> str:
-    """Return whose avatar it is, which with ckpt=FILE only the avatar knows, as a file or mesh may be called."""
+    """Return the subject as a valid file name. (With ckpt=FILE only the avatar knows the subject.)"""
     return folder_name(str(avatar.facts.get("subject") or config.subject), "avatar")
 
 
 def _place(config: ExportConfig, folder: Path, subject: str) -> Path:
-    """Return where the result goes if nobody says so: a file, or for meshes a folder."""
+    """Return the default output: a file, or a folder for meshes."""
     joint = "_" if config.format in MESH_WRITERS else "."
     return folder / "export" / f"{subject}{joint}{config.format}"
 
 
 def _check_place(config: ExportConfig, output: Path) -> Path:
-    """Refuse a place that is taken, or a name that says another format; return it as it is written to."""
+    """Check that the output does not exist (or may be replaced) and has the suffix of the format; return its path."""
     if config.format in MESH_WRITERS:
         return check_folder(output, config.overwrite)
     suffix = output.suffix.lower().lstrip(".")
     if suffix != config.format:
         hint = f"give format={suffix}, or " if suffix in (*BLENDER_FORMATS, "glb") else ""
-        raise UserError(f"output {output} should end in .{config.format}; {hint}give another name")
+        raise UserError(f"output: wanted a name ending in .{config.format}, got {output}; {hint}give another name")
     check_output(output, config.overwrite)
     check_output(_record(config, output), config.overwrite)
     return output
 
 
 def _record(config: ExportConfig, output: Path) -> Path:
-    """Return where the record goes: into a folder of meshes, or beside a file."""
+    """Return the file of the record: in the folder of meshes, or beside the output file."""
     return output / _RECORD if config.format in MESH_WRITERS else output.with_name(f"{output.stem}_{output.suffix[1:]}.json")
 
 
 def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:
-    """Read all motions, and put those on the ground that should stand there."""
+    """Read all motions, and move those to the ground for which `height` says so."""
     wanted: list[tuple[str | None, str | None]] = [(pose, None) for pose in config.pose or ()]
     wanted += [(None, motion) for motion in config.motion or ()]
     clips = []
@@ -183,13 +183,13 @@ def _clips(config: ExportConfig, avatar: Avatar) -> list[Clip]:
 
 
 _Written = tuple[dict[str, Any], list[str], tuple[tuple[str, int, str], ...]]
-"""Facts for the record, lines for people, and frames whose shape could not be followed."""
+"""Facts for the record, lines to print, and frames whose shape could not be computed."""
 
 
 def _write_character(
     config: ExportConfig, avatar: Avatar, clips: list[Clip], options: CharacterOptions, output: Path, blender: list[str]
 ) -> _Written:
-    """Write the file; in a format of Blender's from a temporary .glb."""
+    """Write the file; fbx and usd are converted by Blender from a temporary .glb."""
     subject = _subject(config, avatar)
 
     def export(path: Path) -> ExportReport:
@@ -201,7 +201,11 @@ def _write_character(
     else:
         rates = {clip.motion.frame_rate for clip in clips}
         if len(rates) > 1:
-            log.warning("the motions have several frame rates, %s has one: %g", config.format, clips[0].motion.frame_rate)
+            log.warning(
+                "the motions have different frame rates; %s can have one, and gets %g",
+                config.format,
+                clips[0].motion.frame_rate,
+            )
         with TemporaryDirectory() as folder:
             glb = Path(folder) / f"{subject}.glb"
             report = export(glb)
@@ -214,7 +218,7 @@ def _write_character(
 def _write_meshes(
     config: ExportConfig, avatar: Avatar, clips: list[Clip], options: CharacterOptions, output: Path, blender: list[str]
 ) -> _Written:
-    """Write a mesh a frame."""
+    """Write one mesh per frame."""
     surface = character_surface(avatar, options)
     with atomic_folder(output) as folder:
         skipped = write_sequence(folder, surface, clips, config.format, weight_colors=config.weight_colors)

@@ -1,4 +1,4 @@
-"""The true posed meshes of a chosen motion, where there are any: to be shown beside the avatar's."""
+"""The ground-truth meshes of a selected motion, which `snarf animate beside=[truth]` shows."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from snarfcli.samples.store import SampleStore
 
 __all__ = ["StoredMeshes", "ground_truth_meshes"]
 
-_MADE_FOR = "the built-in subjects (data=builtin, data=clothed) and sequences of samples have one"
-_JOINTS_APART_M = 1e-3  # rest joints of one skeleton that was stored in float32
+_AVAILABLE = "only built-in subjects (data=builtin, data=clothed) and sequences of samples have one"
+_JOINTS_APART_M = 1e-3  # tolerance for rest joints stored in float32
 
 
 class StoredMeshes:
-    """The posed meshes of a sequence of samples, at the frames of a motion made of it. Files are opened at the first one.
+    """The posed meshes of a stored sequence, at the frames of a motion. Files are opened on first use.
 
     Args:
         sequence: the samples.
-        frames: [T] numbers of the frames.
-        shifts: [T, 3] metres, how far each is moved.
+        frames: [T], numbers of the frames in the sequence.
+        shifts: [T, 3], metres, translation added to each mesh.
     """
 
     def __init__(self, sequence: SequenceSamples, frames: list[int], shifts: NDArray[np.float64]) -> None:
@@ -39,7 +39,7 @@ class StoredMeshes:
         self._sequence: SequenceSamples | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_sequence": None}  # mapped files do not travel
+        return {**vars(self), "_sequence": None}  # memory-mapped files cannot be pickled
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -54,20 +54,20 @@ class StoredMeshes:
 def ground_truth_meshes(
     choice: AvatarSelection, motion: MotionSelection, avatar: Avatar, chosen: SelectedMotion, pose: str | None
 ) -> StoredMeshes | BodyMeshes | ClothedMeshes:
-    """Return the true posed mesh of each frame of a chosen motion.
+    """Return the ground-truth mesh of each frame of a selected motion.
 
-    The bodies of the built-in subjects, bare and clothed, are known in every pose; a subject of another data set only in
-    the frames of its samples.
+    The built-in subjects, bare and clothed, have one in every pose; subjects of other data sets only in the frames of their
+    samples.
 
     Args:
-        choice: whose avatar.
-        motion: how the motion was chosen.
-        avatar: knows on which data it was trained.
+        choice: settings that selected the avatar.
+        motion: settings that selected the motion.
+        avatar: the avatar, which records its training data.
         chosen: the motion.
-        pose: the motion's file, if it has one.
+        pose: the motion file, if there is one.
 
     Raises:
-        UserError: there is no truth for this avatar and motion; the message says for what there is.
+        UserError: this avatar and motion have no ground truth.
     """
     data, subject = avatar.facts.get("data", choice.data.name), str(avatar.facts.get("subject", choice.subject))
     poses, translation = chosen.motion.poses, chosen.motion.translation
@@ -75,18 +75,18 @@ def ground_truth_meshes(
         bare = builtin_subject(subject)
         if not _same_joints(bare.skeleton, avatar.skeleton):
             raise UserError(
-                f"beside=[truth]: the avatar of subject {subject} has other joints than the built-in body; leave truth out"
+                f"beside=[truth]: the skeleton of avatar {subject} is not that of the built-in body; leave truth out"
             )
         body = builtin_body()
         if data == "builtin":
             return BodyMeshes(body, bare.betas, poses, translation)
         clothed = ClothedBody(body, bare)
-        assert len(clothed.mesh.faces)  # the clothes are made here, in some seconds, and travel to other processes
+        assert len(clothed.mesh.faces)  # makes the clothes now (some seconds), so that they are pickled for other processes
         return ClothedMeshes(clothed, poses, translation)
     is_stored = pose is None and layout_of(avatar.skeleton) != SMPL and choice.data.name != "builtin"
     if not is_stored:
         played = "pose files" if pose is not None else "built-in motions"
-        raise UserError(f"beside=[truth]: there is no ground truth of {played} for data={data}; {_MADE_FOR}; leave truth out")
+        raise UserError(f"beside=[truth]: {played} have no ground truth with data={data}: {_AVAILABLE}; leave truth out")
     if motion.frame_rate is not None:
         raise UserError("beside=[truth]: the samples have no meshes between their frames; leave out frame_rate, or truth")
     store = SampleStore.open(choice.data_root, choice.data.name, choice.subject)

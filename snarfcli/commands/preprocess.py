@@ -1,4 +1,7 @@
-"""`snarf preprocess`: sample occupancies from the posed meshes of a subject."""
+"""`snarf preprocess`: sample occupancy points from the posed meshes of a subject.
+
+Imports of the samplers stand inside `run`: they load PyTorch and the mesh libraries, which --help does not need.
+"""
 
 from __future__ import annotations
 
@@ -21,40 +24,40 @@ class PreprocessConfig:
     """Settings of `snarf preprocess`."""
 
     subject: str = MISSING
-    """The subject's id, such as 50002; `all` for every subject of the data set."""
+    """Subject, such as 50002; all for every subject of the data set."""
     data: DataConfig = MISSING
-    """The data set."""
+    """Data set."""
     data_root: str = MISSING
-    """The data folder; samples go under `processed/{data}/{subject}` in it."""
+    """Data folder; samples are written to <data_root>/processed/<data>/<subject>."""
     body: str | None = MISSING
-    """Body model, or a folder in which it lies under the name it is downloaded with; null: looked for below data_root."""
+    """Body model file, or a folder with it (under its original file name); null searches below data_root."""
     points_per_frame: int = MISSING
-    """Points a frame, a multiple of 8: half uniform in the papers' box, half near the surface."""
+    """Number of points per frame, a multiple of 8: half uniform in the papers' box, half near the surface."""
     surface_noise_m: float = MISSING
-    """Standard deviation of the near-surface points' distance along each axis, metres."""
+    """Standard deviation of the near-surface points from the surface, along each axis, metres."""
     padding: float = MISSING
-    """How much longer the sampling cube is than the longest side of the mesh's box, as a share."""
+    """Enlargement of the sampling cube, as a share of the longest side of the bounding box of the mesh."""
     inside_test: str = MISSING
-    """`winding`: overlapping parts are inside. `parity`: they are outside, as in the papers' released code."""
+    """winding: points in overlapping parts are inside; parity: they are outside, as in the papers' code."""
     workers: int = MISSING
-    """Processes; 0: one a core."""
+    """Number of processes; 0: one per core."""
     seed: int = MISSING
-    """Start of the random numbers; the samples do not depend on the number of workers."""
+    """Seed of the random points; the samples do not depend on the number of workers."""
     overwrite: bool = MISSING
-    """Discard the samples that are there and start again."""
+    """Delete existing samples and start again."""
     sequences: list[str] = MISSING
-    """Names of the sequences to make; all if empty."""
+    """Names of the sequences to sample; empty for all."""
     skip_broken: bool = MISSING
-    """Leave out sequences that cannot be used, and list them, instead of stopping."""
+    """Leave out sequences that cannot be used, and list them, instead of stopping with an error."""
     experiment: str | None = None
-    """Name of the preset of settings that the rest starts from; null for none."""
+    """Preset of settings, which other settings override; null for none."""
 
 
 def run(config: PreprocessConfig) -> None:
-    """Make the samples of one subject or of all; what is there already is kept.
+    """Sample one subject or all subjects; existing samples are kept.
 
     Raises:
-        UserError: a value cannot be used, a subject or sequence is unknown, or the samples there do not go with the settings.
+        UserError: a setting cannot be used, a subject or sequence is unknown, or existing samples have other settings.
         OSError: the data folder cannot be written to, or the disk is full.
     """
     from snarfcli.datasets.registry import find_dataset
@@ -80,7 +83,7 @@ def run(config: PreprocessConfig) -> None:
         if step < 1:
             raise UserError(f"data: wanted a frame step of at least 1 for {split} sequences, got {step}")
     if config.workers < 0:
-        raise UserError(f"workers: wanted a number of processes, or 0 for one a core, got {config.workers}")
+        raise UserError(f"workers: wanted a number of processes, or 0 for one per core, got {config.workers}")
     workers = config.workers or count_cores()
     request = DataRequest(config.data, Path(config.data_root), config.body)
     for subject in source.subjects(request) if config.subject == "all" else [config.subject]:

@@ -1,15 +1,19 @@
-"""`snarf reproduce`: the papers' tables and figures, from training to the report, in one command."""
+"""`snarf reproduce`: make the papers' tables and figures, from training to the report.
+
+Imports of Hydra stand inside functions: it takes a third of a second, which --help does not need.
+"""
 
 from __future__ import annotations
 
 import logging
 import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from omegaconf import MISSING
+from omegaconf import MISSING, OmegaConf
 
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.train import TrainConfig
@@ -30,7 +34,7 @@ __all__ = ["ReproduceConfig", "resolve_training", "run"]
 
 log = logging.getLogger(__name__)
 
-# The avatar is the same whatever these are, or they name the run.
+# Settings that do not change the avatar, or only name the run.
 _NOT_OF_THE_AVATAR = ("subject", "seed", "run", "data_root", "output_root", "resume", "overwrite", "device", "threads")
 
 
@@ -39,54 +43,54 @@ class ReproduceConfig:
     """Settings of `snarf reproduce`."""
 
     what: str | None = MISSING
-    """table1, table2, ablations, stick2d, clothed or all; may be given without its name."""
+    """table1, table2, ablations, stick2d, clothed or all; can be given as first argument without its name."""
     subjects: list[str] = MISSING
-    """Subjects; empty: 50002 and 50004 of the built-in set, all ten of DFaust."""
+    """Subjects; empty for 50002 and 50004 (built-in), or all ten (DFaust)."""
     seeds: list[int] = MISSING
-    """Seeds; with several the tables have standard deviations."""
+    """Seeds; with several seeds the tables have standard deviations."""
     training: str | None = MISSING
-    """Training preset; null: quick, and stick2d for the 2D stick, which keeps it with all."""
+    """Training preset; null for quick, or stick2d for the 2D stick (always with `all`)."""
     data: str | None = MISSING
-    """Data set; null: builtin, stick2d or clothed. Licensed ones: dfaust (with PosePrior), cape for the clothed experiment."""
+    """Data set; null for builtin, stick2d or clothed. Licensed: dfaust (with PosePrior), and cape (clothed experiment)."""
     systems: list[str] = MISSING
-    """Rows of the table to make, by the names that --dry-run prints, such as [nasa,ours-local]; empty: all."""
+    """Rows of the table, such as [nasa,ours-local] (--dry-run prints the names); empty for all."""
     extra: list[str] = MISSING
-    """Further settings of every training, such as [training.steps=1000]; such runs have folders of their own."""
+    """Further settings of every training, such as [training.steps=1000]; these runs have separate folders."""
     data_root: str = MISSING
-    """Folder with the processed samples; missing ones are made."""
+    """Folder with the processed samples; missing samples are made."""
     output_root: str = MISSING
-    """Folder for results; the runs go to <output_root>/<data>/<subject>/<row>-<training>-s<seed>."""
+    """Folder for results; run folders are <output_root>/<data>/<subject>/<row>-<training>-s<seed>."""
     report: str | None = MISSING
-    """Folder for the tables and figures; null: <output_root>/reproduce/<what>."""
+    """Folder for tables and figures; null for <output_root>/reproduce/<what>."""
     launcher: str = MISSING
     """basic (one after the other), joblib, submitit_local or submitit_slurm."""
     processes: int = MISSING
-    """Jobs at a time; on a cluster at most."""
+    """Number of jobs at a time; on a cluster the maximum."""
     launcher_settings: list[str] = MISSING
     """Settings of Hydra's launcher, such as [partition=gpu,gpus_per_node=1]."""
     threads: int | None = MISSING
-    """Threads of each job; null: the cores shared among the processes."""
+    """Threads per job; null divides the cores among the processes."""
     device: str = MISSING
     """auto, cpu, cuda or cuda:N."""
     max_frames: int | None = MISSING
-    """Evaluate so many frames; null for all."""
+    """Number of frames to evaluate; null for all."""
     surface_frames: int = MISSING
-    """In so many frames surfaces are extracted and compared too (Chamfer distance, normals, F-score)."""
+    """Number of frames in which the surface is compared with the ground truth (Chamfer, normals, F-score); 0 disables this."""
     figures: bool = MISSING
-    """Whether to draw figures."""
+    """Draw figures."""
     figure_resolution: int = MISSING
     """Voxels along the longest side of the meshes in the figures."""
     only_report: bool = MISSING
-    """Run nothing; write tables and figures from what is there."""
+    """Run nothing; write tables and figures of the existing results."""
     dry_run: bool = MISSING
-    """Print what would be run and stop."""
+    """Print the commands that would be run, and stop."""
 
 
 def run(config: ReproduceConfig) -> int:
-    """Make what is missing and write a report for each experiment; return 1 if a run failed, which the tables show.
+    """Run what is missing and write a report for each experiment; return 1 if a run has failed, 0 otherwise.
 
     Raises:
-        UserError: something chosen is unknown or cannot be used; nothing has been run.
+        UserError: an option is unknown or cannot be used; nothing has been run.
         OSError: a folder cannot be written to, or the disk is full.
     """
     launcher = _check(config)
@@ -103,14 +107,14 @@ def run(config: ReproduceConfig) -> int:
         return 0
     folders = [_report_folder(config, plan) for plan in plans]
     for folder in folders:
-        folder.mkdir(parents=True, exist_ok=True)  # found out before the work that it cannot be written to
+        folder.mkdir(parents=True, exist_ok=True)  # fails before the work if it cannot be written
     if not config.only_report:
         log.info("%d runs, launcher %s, %d at a time", len(jobs), launcher.name, launcher.processes)
         progress = _Progress(jobs, launcher.processes)
         try:
             launch(jobs, Path(config.output_root) / "reproduce" / "jobs", launcher, progress)
         except KeyboardInterrupt:
-            log.info("stopped with %d of %d runs done; the same command goes on from there", progress.done, len(jobs))
+            log.info("stopped with %d of %d runs done; run the same command to continue", progress.done, len(jobs))
             raise
     results: list[Result] = []
     for plan, folder in zip(plans, folders, strict=True):
@@ -128,25 +132,24 @@ def run(config: ReproduceConfig) -> int:
 
 
 def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
-    """Return the configuration of `snarf train` under overrides, without what the avatar does not depend on.
+    """Return the configuration of `snarf train` for overrides, without the settings that do not change the avatar.
 
     Raises:
-        UserError: an override names no setting, or no option.
+        UserError: an override names an unknown setting or option.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
-    from omegaconf import OmegaConf
 
     check_overrides(overrides, TrainConfig, "train")
     presets = preset_groups(TrainConfig, "train")
     named = [override.partition("=") for override in overrides]
     overrides = [f"{presets.get(name, name)}={value}" for name, _, value in named]
     register_schemas("train", TrainConfig)
-    running = GlobalHydra.instance().hydra  # of this command itself: there can only be one
+    running = GlobalHydra.instance().hydra  # Hydra of this command; only one can be active
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(config_folder().absolute()), version_base="1.3"):
-            config = OmegaConf.to_container(compose("train", list(overrides)), resolve=True)
+            config = cast(dict[str, Any], OmegaConf.to_container(compose("train", list(overrides)), resolve=True))
     finally:
         GlobalHydra.instance().clear()
         if running is not None:
@@ -158,14 +161,14 @@ def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def _check(config: ReproduceConfig) -> Launcher:
-    """Refuse settings that cannot be used, before any work starts; return how jobs are distributed."""
+    """Check all settings before any work starts; return the launcher."""
     check_choice("launcher", config.launcher, LAUNCHERS)
     for name, least in {"processes": 1, "threads": 1, "max_frames": 1, "surface_frames": 0, "figure_resolution": 16}.items():
         check_number(name, getattr(config, name), least)
     for one in config.launcher_settings:
         if "=" not in one:
             raise UserError(f"launcher_settings: wanted settings such as [partition=gpu], got '{one}'")
-    if config.launcher != "submitit_slurm":  # there the job's machine may have what this one has not
+    if config.launcher != "submitit_slurm":  # a cluster may have devices that this machine lacks
         choose_device(config.device)
     threads = config.threads
     if threads is None and config.launcher in ("joblib", "submitit_local"):
@@ -184,7 +187,7 @@ def _report_folder(config: ReproduceConfig, plan: Plan) -> Path:
 
 
 def _print_plan(jobs: Sequence[Job]) -> None:
-    """Print each run and the commands that make it."""
+    """Print each run and its commands."""
     made: set[str] = set()
     for number, job in enumerate(jobs, 1):
         log.info("run %d of %d: %s: %s, %s", number, len(jobs), job.row, job.name, job.folder)
@@ -197,12 +200,9 @@ def _print_plan(jobs: Sequence[Job]) -> None:
 
 
 def _command(config: ReproduceConfig) -> str:
-    """Return the command: what differs from the defaults."""
-    import shlex
-
-    from omegaconf import OmegaConf
-
-    defaults = OmegaConf.to_container(OmegaConf.load(config_folder() / "reproduce" / "reproduce.yaml"))
+    """Return the command line, with the settings that differ from the defaults."""
+    path = config_folder() / "reproduce" / "reproduce.yaml"
+    defaults = cast(dict[str, Any], OmegaConf.to_container(OmegaConf.load(path)))
     words = ["snarf", "reproduce", str(config.what)]
     for name, value in asdict(config).items():
         if name not in ("what", "only_report", "dry_run") and value != defaults[name]:
@@ -218,7 +218,7 @@ def _written(value: Any) -> str:
 
 
 class _Progress:
-    """A line when a run starts and one when it ends."""
+    """Prints one line when a run starts, and one when it ends."""
 
     def __init__(self, jobs: Sequence[Job], processes: int) -> None:
         self.jobs, self.processes = jobs, processes
@@ -249,7 +249,7 @@ class _Progress:
             for name in ("bbox", "surface")
         ]
         seconds = sum(status.seconds.values())
-        return ", ".join([*parts, "IoU in/out of distribution", f"{seconds:.0f} s" if seconds else "was there already"])
+        return ", ".join([*parts, "IoU in/out of distribution", f"{seconds:.0f} s" if seconds else "existed already"])
 
     @staticmethod
     def _is_there(job: Job) -> bool:
@@ -257,7 +257,7 @@ class _Progress:
         return status is not None and status.state == "done" and status.digest == job.digest
 
     def _left(self) -> str:
-        """Return about how long the rest takes, by the mean of the runs that took time."""
+        """Return an estimate of the remaining time, from the mean duration of the finished runs."""
         left = sum(number not in self._ended and not self._is_there(job) for number, job in enumerate(self.jobs))
         if not left or not self._worked_s:
             return ""

@@ -1,4 +1,4 @@
-"""`snarf reproduce_job`: one run of a plan. Hydra's launchers call it; people call `snarf reproduce`."""
+"""`snarf reproduce_job`: one run of a plan. Called by Hydra's launchers, which `snarf reproduce` starts."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class ReproduceJobConfig:
     """Settings of `snarf reproduce_job`."""
 
     plan: str = MISSING
-    """The file that `snarf reproduce` wrote."""
+    """Plan file that `snarf reproduce` has written."""
     job: int = MISSING
-    """Number of the job in it."""
+    """Number of the job in the plan."""
 
 
 def run(config: ReproduceJobConfig) -> None:
-    """Run one job; what becomes of it is written beside the plan.
+    """Run one job; its status is written beside the plan.
 
     Raises:
-        UserError: there is no such plan or job.
+        UserError: the plan or the job does not exist.
     """
     run_planned_job(Path(config.plan).absolute(), config.job)

@@ -1,9 +1,10 @@
-"""What several commands let people choose: whose avatar, and which frames of a motion."""
+"""Settings that several commands share: the avatar, and the frames of a motion."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, Motion, builtin_motion, read_motion
 from snarfcli.motions.layouts import HANDS, SMPL, layout_of
-from snarfcli.motions.up_axis import UPS
+from snarfcli.motions.up_axis import UPS, Up
 from snarfcli.runs import choose_device, find_avatar, run_folder, set_threads
 from snarfcli.samples.stored_motion import stored_motion
 
@@ -39,83 +40,83 @@ _FRAME_RATES = (1.0, 1000.0)
 
 @dataclass
 class AvatarSelection:
-    """Whose avatar, and where it computes."""
+    """Settings that select an avatar and the device it runs on."""
 
     subject: str = MISSING
-    """Whose avatar, such as 50002."""
+    """Subject of the avatar, such as 50002."""
     data: DataConfig = MISSING
-    """Which data the avatar was trained on."""
+    """Data set that the avatar was trained on."""
     data_root: str = MISSING
-    """Folder with the processed samples, whose motions are for skeletons that the built-in ones do not fit."""
+    """Folder of processed samples; their motions are used for skeletons other than SMPL."""
     output_root: str = MISSING
     """Folder with the runs; the avatar is <output_root>/<data>/<subject>/<run>/avatar.pt."""
     run: str = MISSING
     """Name of the run."""
     ckpt: str | None = MISSING
-    """Avatar file or run folder to use instead; results go beside it."""
+    """Avatar file or run folder to use instead; results are written beside it."""
     device: str = MISSING
     """auto, cpu, cuda or cuda:N."""
     threads: int | None = MISSING
-    """Threads for tensor work; null leaves PyTorch's choice."""
+    """Threads for tensor work; null keeps PyTorch's choice."""
 
 
 @dataclass
 class MotionSelection:
-    """How a motion is read, and which part of it is taken."""
+    """Settings that say how a motion is read, and which frames of it are used."""
 
     up: str = MISSING
-    """Which way is up in the pose file: auto, y or z."""
+    """Up axis of the pose file: auto, y or z."""
     hands: str = MISSING
-    """SMPL's hand joints where the pose file has fingers: rest (straight) or released (as the released code took them)."""
+    """SMPL's hand joints if the pose file has fingers: rest (straight), or released (as in the papers' code)."""
     mapping: str | None = MISSING
-    """For .bvh and .glb: JSON file {joint of the avatar: joint of the pose file}; null goes by the usual names."""
+    """For .bvh and .glb: JSON file {joint of the avatar: joint of the pose file}; null matches common joint names."""
     clip: str | None = MISSING
     """For .bvh and .glb: name or number of the animation; null for the first."""
     motion_seed: int = MISSING
-    """Variant of the built-in motion."""
+    """Seed of the built-in motion; each seed gives another variant."""
     motion_frame_rate: float = MISSING
-    """Frames a second of the built-in motion."""
+    """Frames per second of the built-in motion."""
     start: int = MISSING
     """First frame."""
     stop: int | None = MISSING
-    """Frame to stop before; null for the end."""
+    """Frame after the last one; null for the end."""
     step: int = MISSING
-    """Take every so many frames; the pace stays."""
+    """Keep every n-th frame; playback speed is unchanged."""
     frame_rate: float | None = MISSING
-    """Resample what was taken to so many frames a second, at the same pace; null leaves the frames as they are."""
+    """Resample to this number of frames per second, at the same playback speed; null keeps the frames."""
     max_frames: int | None = MISSING
-    """Stop after so many frames; null for all."""
+    """Maximum number of frames; null for all."""
     in_place: bool = MISSING
-    """Whether the body stays over one spot: the root keeps its height, but does not travel."""
+    """Keep the body in one place: the root moves up and down only."""
 
 
 @dataclass(frozen=True, eq=False)
 class SelectedMotion:
-    """The part of a motion that was asked for."""
+    """The selected frames of a motion."""
 
     motion: Motion
-    """Its frames, y up, resampled and in place if so wished."""
+    """The selected frames, y up, resampled and in place if requested."""
     whole: Motion
-    """All that was read."""
+    """All frames that were read."""
     first: int
-    """Number of the first frame in the whole motion."""
+    """Number of the first selected frame in the whole motion."""
     numbers: list[int]
-    """Number of each frame in the whole motion; of a resampled one, in what was made of it."""
+    """Number of each frame in the whole motion; if resampled, in the resampled one."""
     bone_transforms: NDArray[np.float32] | None = None
-    """[T, J, 4, 4] canonical to posed, metres, where joints stretch so that the poses do not say it all; else None."""
+    """[T, J, 4, 4], canonical to posed, metres, if joints stretch (which poses cannot express); otherwise None."""
 
 
 def load_selected_avatar(choice: AvatarSelection) -> tuple[Avatar, Path]:
-    """Load the avatar of a choice, on its device and with its threads; return it and its file.
+    """Load the selected avatar on its device; return it and its file. Sets the number of threads.
 
     Raises:
-        UserError: there is none, it cannot be used, or the device is not there; the message says what to do.
+        UserError: the avatar does not exist or cannot be used, or the device does not exist.
     """
     trained_on = choice.data.avatars or choice.data.name
     subject_folder = run_folder(choice.output_root, trained_on, choice.subject, choice.run).parent
     unknown = choice.data.name == "builtin" and choice.subject not in BUILTIN_SUBJECTS
     if unknown and choice.ckpt is None and not subject_folder.exists():
-        builtin_subject(choice.subject)  # says which name is near
+        builtin_subject(choice.subject)  # raises, with the most similar name
     path = find_avatar(choice.output_root, trained_on, choice.subject, choice.run, choice.ckpt)
     device = choose_device(choice.device)
     set_threads(choice.threads)
@@ -123,10 +124,10 @@ def load_selected_avatar(choice: AvatarSelection) -> tuple[Avatar, Path]:
 
 
 def check_motion_selection(choice: MotionSelection) -> None:
-    """Refuse, before any work starts, settings of a motion that cannot be used.
+    """Check the settings of a motion before any work starts.
 
     Raises:
-        UserError: for the first one.
+        UserError: a setting cannot be used.
     """
     for name, choices in (("up", UPS), ("hands", HANDS)):
         check_choice(name, getattr(choice, name), choices)
@@ -139,25 +140,25 @@ def check_motion_selection(choice: MotionSelection) -> None:
 def select_motion(
     choice: MotionSelection, avatar: AvatarSelection, skeleton: Skeleton, pose: str | None, motion: str | None
 ) -> SelectedMotion:
-    """Read a motion and take the part of it that was asked for: first the frames, then their rate, then their number.
+    """Read a motion and select frames: start, stop and step are applied first, then frame_rate, then max_frames.
 
     Args:
-        choice: how to read it, and which part.
-        avatar: whose samples hold motions, for skeletons that the built-in ones do not fit.
-        skeleton: whose poses are wanted.
+        choice: how to read it, and which frames.
+        avatar: selects the samples that hold motions for skeletons other than SMPL.
+        skeleton: the skeleton of the avatar, which the poses are made for.
         pose: motion file, or folder of frames; None for the built-in `motion`.
-        motion: name of a built-in motion of SMPL's joints, or of a sequence of the samples of any other skeleton; None for
-            jumping_jacks, or for the held-out sequence.
+        motion: name of a built-in motion (SMPL) or of a sequence of the samples (other skeletons); None for jumping_jacks
+            or the held-out sequence.
 
     Raises:
-        UserError: there is no such motion, it does not fit the skeleton, or nothing of it is left.
+        UserError: the motion does not exist, does not fit the skeleton, or no frame is left.
     """
     whole, transforms = _read(choice, avatar, skeleton, pose, motion)
     numbers = list(range(*slice(choice.start, choice.stop, choice.step).indices(whole.num_frames)))
     if not numbers:
         stop = "null" if choice.stop is None else choice.stop
         raise UserError(
-            f"start={choice.start}, stop={stop} leave no frame: {whole.name} has frames 0 to {whole.num_frames - 1}"
+            f"start={choice.start}, stop={stop} leave no frame; {whole.name} has frames 0 to {whole.num_frames - 1}"
         )
     taken = replace(
         whole,
@@ -169,7 +170,7 @@ def select_motion(
     first = numbers[0]
     if choice.frame_rate is not None:
         if transforms is not None:
-            raise UserError(f"frame_rate is for motions whose joints do not stretch, those of {whole.name} do; leave it out")
+            raise UserError(f"frame_rate: wanted a motion whose joints do not stretch, got {whole.name}; leave frame_rate out")
         taken = taken.resampled(choice.frame_rate)
         numbers = list(range(taken.num_frames))
     taken, numbers = taken.slice(stop=choice.max_frames), numbers[: choice.max_frames]
@@ -186,9 +187,11 @@ def select_motion(
 def _read(
     choice: MotionSelection, avatar: AvatarSelection, skeleton: Skeleton, pose: str | None, name: str | None
 ) -> tuple[Motion, NDArray[np.float32] | None]:
-    """Return the whole motion, with y up, and its bone transforms where the poses do not say it all."""
+    """Return the whole motion, y up, and its bone transforms if joints stretch."""
     if pose is not None:
-        motion = read_motion(pose, skeleton, up=choice.up, hands=choice.hands, mapping=choice.mapping, clip=choice.clip)
+        motion = read_motion(
+            pose, skeleton, up=cast(Up, choice.up), hands=choice.hands, mapping=choice.mapping, clip=choice.clip
+        )
         return motion, None
     is_smpl = layout_of(skeleton) == SMPL
     if not is_smpl and avatar.data.name != "builtin" and name not in BUILTIN_MOTIONS:
@@ -196,7 +199,7 @@ def _read(
     motion = builtin_motion(name or _MOTION, choice.motion_seed, frame_rate=choice.motion_frame_rate)
     if not is_smpl:
         raise UserError(
-            f"motion {motion.name} is for SMPL's 24 joints, the avatar has {skeleton.num_joints} of another kind;"
-            " give a motion of its own by --pose FILE, such as .bvh, .glb or .npz"
+            f"motion {motion.name} is for SMPL's 24 joints, the avatar has another skeleton with {skeleton.num_joints} joints; "
+            "give a motion for it by --pose FILE, such as .bvh, .glb or .npz"
         )
     return motion, None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -55,46 +56,46 @@ class TrainConfig:
     """Settings of `snarf train`."""
 
     subject: str = MISSING
-    """Whose avatar, such as 50002."""
+    """Subject of the avatar, such as 50002."""
     data: DataConfig = MISSING
-    """Where the samples come from."""
+    """Data set of the samples."""
     model: ModelConfig = MISSING
-    """Which system."""
+    """System of the papers."""
     skinning: SkinningConfig = MISSING
-    """The field of skinning weights."""
+    """Field of skinning weights."""
     search: SearchConfig = MISSING
-    """The correspondence search."""
+    """Correspondence search."""
     shape: ShapeConfig = MISSING
-    """The canonical occupancy network."""
+    """Canonical occupancy network."""
     condition: ConditionConfig = MISSING
-    """What of the pose each canonical point is told."""
+    """Pose condition of the canonical points."""
     training: TrainingConfig = MISSING
-    """Steps, batches, losses."""
+    """Steps, batches and losses."""
     data_root: str = MISSING
     """Folder with the processed samples."""
     output_root: str = MISSING
-    """Folder for results; the run goes to <output_root>/<data>/<subject>/<run>."""
+    """Folder for results; the run folder is <output_root>/<data>/<subject>/<run>."""
     run: str = MISSING
     """Name of the run."""
     resume: bool = MISSING
-    """Continue an interrupted run in the same folder; a finished run is left as it is."""
+    """Continue an interrupted run in the same folder; a finished run is not changed."""
     overwrite: bool = MISSING
-    """Replace a run in the same folder."""
+    """Replace an existing run in the same folder."""
     device: str = MISSING
     """auto, cpu, cuda or cuda:N."""
     threads: int | None = MISSING
-    """Threads for tensor work; null leaves PyTorch's choice."""
+    """Threads for tensor work; null keeps PyTorch's choice."""
     seed: int = MISSING
-    """Seed of everything random."""
+    """Seed of all random numbers."""
     experiment: str | None = None
-    """Name of the preset of settings that the rest starts from; null for none."""
+    """Preset of settings, which other settings override; null for none."""
 
 
 def run(config: TrainConfig) -> None:
     """Train one subject and write the run folder: avatar, checkpoint, metrics, configuration, TensorBoard events.
 
     Raises:
-        UserError: there are no samples, a setting cannot be used, or the folder holds a run that these settings do not go with.
+        UserError: there are no samples, a setting cannot be used, or the folder has a run with other settings.
         OSError: the folder cannot be written to, or the disk is full.
     """
     _check(config)
@@ -103,7 +104,7 @@ def run(config: TrainConfig) -> None:
     started = checkpoint.exists() or (folder / "avatar.pt").exists()
     if started and not (config.resume or config.overwrite):
         raise UserError(
-            f"{folder} already holds a run; give resume=true to continue it, overwrite=true to replace it, "
+            f"{folder} already has a run; give resume=true to continue it, overwrite=true to replace it, "
             "or run=NAME for another folder"
         )
     device = choose_device(config.device)
@@ -118,7 +119,7 @@ def run(config: TrainConfig) -> None:
 
     try:
         trainer = new_trainer(config, store, device)
-    except ValueError as error:  # networks and grids name the setting that they cannot use
+    except ValueError as error:  # the message of a network or grid names the setting
         raise UserError(str(error)) from error
     if config.resume and started:
         state = load_checkpoint(checkpoint, CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
@@ -159,14 +160,16 @@ def run(config: TrainConfig) -> None:
 
 
 def _check(config: TrainConfig) -> None:
-    """Refuse settings that cannot be used, before any work starts."""
+    """Check all settings before any work starts."""
     training = config.training
     for name in _AT_LEAST_ONE:
         check_number(f"training.{name}", getattr(training, name), 1)
     for name in _NOT_NEGATIVE:
         check_number(f"training.{name}", getattr(training, name), 0)
     if training.uniform_points + training.surface_points == 0:
-        raise UserError("training.uniform_points and training.surface_points are both 0; nothing could be learned")
+        raise UserError(
+            "training.uniform_points, training.surface_points: wanted at least one point, got 0 and 0; set one of them"
+        )
     check_number("training.learning_rate", training.learning_rate, 0, 1)
     check_number("training.final_learning_rate", training.final_learning_rate, 0, 1)
     check_number("training.average_decay", training.average_decay, 0, 1)
@@ -184,18 +187,20 @@ def _check(config: TrainConfig) -> None:
     for name, least in _LEAST_OF_PARTS.items():
         check_number(f"model.{name}", getattr(config.model, name), least)
     if config.model.name == "snarf" and config.search.name != "broyden":
-        raise UserError("model=snarf has no cells to search; leave search out, or give search=snarf or search=broyden")
+        raise UserError(
+            "search: wanted snarf or broyden with model=snarf, got {config.search.name}; give one of them, or leave search out"
+        )
     check_skinning(config.skinning, config.search)
     if config.model.name != "fast_snarf" and config.skinning.name in ("voxel", "preset"):
         raise UserError(
-            f"skinning={config.skinning.name} is for model=fast_snarf; model {config.model.name} has weights of its own kind"
+            f"skinning={config.skinning.name} is for model=fast_snarf, got model={config.model.name}; leave skinning out"
         )
     check_search(config.search)
     check_number("seed", config.seed, 0)
 
 
 def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -> Trainer:
-    """Return a fresh avatar of the store's subject in the hands of a trainer."""
+    """Return the trainer of a new, untrained avatar of the store's subject."""
     template = _template(config.model.name, store)
     search = with_start_bones(config.search, store.skeleton)
     surface = rough_canonical_points(store)
@@ -203,8 +208,9 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
     grid = CanonicalGrid.around(surface, skinning.margin_m)
     field = None
     if skinning.name == "preset":
-        shape = tuple(skinning.resolution[::-1])
-        field = read_preset_weights(skinning.weights_file, grid, shape, store.skeleton.num_joints)
+        assert skinning.weights_file is not None  # see check_skinning
+        width, height, depth = skinning.resolution
+        field = read_preset_weights(skinning.weights_file, grid, (depth, height, width), store.skeleton.num_joints)
     avatar = Avatar(
         AvatarConfig(config.model, skinning, search, config.shape, config.condition),
         store.skeleton,
@@ -218,17 +224,17 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
 
 
 def _template(model: str, store: SampleStore) -> MeshTemplate | None:
-    """Return the subject's mesh with its true skinning weights for a system that is told them, else None.
+    """Return the subject's mesh with ground-truth skinning weights if the system uses them, else None.
 
     Raises:
-        UserError: the samples hold none.
+        UserError: the samples have none.
     """
     if not SYSTEMS[model].needs_template:
         return None
     if store.template is None:
         raise UserError(
-            f"model={model} needs the subject's mesh with its true skinning weights, which the samples of {store.data} "
-            f"{store.subject} do not hold; choose another model, or data made with a body model or a rig"
+            f"model={model} needs a mesh with ground-truth skinning weights, which the samples of {store.data} "
+            f"{store.subject} do not have; choose another model, or data made with a body model or a rig"
         )
     return store.template
 
@@ -240,7 +246,7 @@ def _write_config(folder: Path, config: TrainConfig) -> None:
 
 
 def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seconds: float) -> dict[str, Any]:
-    """Return what `metrics.json` says about the training run."""
+    """Return the content of `metrics.json` after a training run."""
     validation = result["validation"]
     held_back = sum(len(sequence.val_frames) for sequence in trainer.store.sequences("train"))
     return {
@@ -257,7 +263,7 @@ def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seco
 
 
 def _facts(config: TrainConfig) -> dict[str, Any]:
-    """Return what `metrics.json` says however the run ends."""
+    """Return the content of `metrics.json` that a failed run has too."""
     return {
         "data": config.data.name,
         "subject": config.subject,
@@ -268,13 +274,13 @@ def _facts(config: TrainConfig) -> dict[str, Any]:
 
 
 class _Scalars:
-    """A TensorBoard writer for a run folder, as a context that yields a function (step, named numbers)."""
+    """TensorBoard writer of a run folder; a context manager that yields the function (step, named numbers)."""
 
     def __init__(self, folder: Path, step: int) -> None:
         self.folder, self.step = folder, step
 
-    def __enter__(self):
-        from torch.utils.tensorboard import SummaryWriter
+    def __enter__(self) -> Callable[[int, dict[str, float]], None]:
+        from torch.utils.tensorboard import SummaryWriter  # takes seconds, and is needed only now
 
         self.writer = SummaryWriter(str(self.folder / "tensorboard"), purge_step=self.step or None)
         return self.write

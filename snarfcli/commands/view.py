@@ -1,4 +1,4 @@
-"""`snarf view`: an avatar in the browser, to pose it, to play motions and to look at it closely."""
+"""`snarf view`: show an avatar in the browser, pose it and play motions."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ class ViewConfig(AvatarSelection, MotionSelection):
     """Settings of `snarf view`."""
 
     pose: list[str] = MISSING
-    """Motions to choose from, the first is played: .npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, or folders of frames."""
+    """Motion files (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb) or folders of frames; the first is played."""
     motion: str | None = MISSING
-    """Built-in motion, or sequence of the samples, that is played first where there is no pose file; null for none."""
+    """Built-in motion or sequence of the samples that is played first if there is no pose file; null for none."""
     surface: str = MISSING
-    """At first: skinned (the canonical mesh moved by its skin, at once) or field (the union, made in the background)."""
+    """Surface at the start: skinned (the moved canonical mesh, shown at once) or field (extracted in the background)."""
     resolution: int = MISSING
-    """At first: voxels along the longest side, 16 to 1024."""
+    """Voxels along the longest side at the start, 16 to 1024."""
     weight_colors: bool = MISSING
-    """Whether vertices are coloured by their skinning weights at first."""
+    """Colour vertices by their skinning weights at the start."""
     host: str = MISSING
-    """Address to listen at: 127.0.0.1 for this machine only, 0.0.0.0 for whoever reaches it."""
+    """Address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for all machines in the network."""
     port: str = MISSING
-    """Port to listen at; auto (or 0) for any free one."""
+    """Port to listen on; auto (or 0) for any free port."""
     open: bool = MISSING
-    """Whether to open the page in the browser, where there is a display."""
+    """Open the page in the browser if there is a display."""
 
 
 def run(config: ViewConfig) -> int:
@@ -65,7 +65,7 @@ def run(config: ViewConfig) -> int:
         0 if the server ends by itself; Ctrl-C raises KeyboardInterrupt, which ends the command with 130.
 
     Raises:
-        UserError: there is no viser, no avatar or no such motion, or the port is in use.
+        UserError: viser is not installed, the avatar or a motion does not exist, or the port is in use.
     """
     server = start(config)
     try:
@@ -76,7 +76,7 @@ def run(config: ViewConfig) -> int:
 
 
 def start(config: ViewConfig) -> ViewServer:
-    """Start serving the page, tell where, open the browser where that makes sense, and return at once.
+    """Start the server, print its address, open the browser if there is a display, and return.
 
     Raises:
         UserError: as `run`.
@@ -109,7 +109,7 @@ def start(config: ViewConfig) -> ViewServer:
 
 
 def _check(config: ViewConfig) -> int:
-    """Refuse settings that cannot be used, before any work starts; return the port, 0 for any."""
+    """Check all settings before any work starts; return the port, 0 for any free one."""
     check_motion_selection(config)
     check_choice("surface", config.surface, SURFACE_NAMES)
     check_number("resolution", config.resolution, *_RESOLUTIONS)
@@ -117,15 +117,15 @@ def _check(config: ViewConfig) -> int:
     if text == "auto":
         return 0
     if not (text.isascii() and text.isdecimal() and int(text) < 65536):
-        raise UserError(f"port: wanted a number from 1 to 65535, or auto for any free one, got '{config.port}'")
+        raise UserError(f"port: wanted a number from 1 to 65535, or auto for any free port, got '{config.port}'")
     return int(text)
 
 
 class _Shelf:
-    """The motions that can be chosen on the page.
+    """The motions that the page offers. Pose files and the first motion are read at the start.
 
     Raises:
-        UserError: a pose file or the motion to play first cannot be used; better now than on the page.
+        UserError: a pose file or the first motion cannot be used.
     """
 
     def __init__(self, config: ViewConfig, avatar: Avatar) -> None:
@@ -138,12 +138,12 @@ class _Shelf:
         self.names: list[str] = [*self._loaded, *_own_motions(config, avatar)]
         first = next(iter(self._loaded), config.motion)
         self.first: tuple[str, Any, Any] | None = None if first is None else (first, *self.load(first))
-        """Name, motion and bone transforms of what is played first; None for nothing."""
+        """Name, motion and bone transforms of the first motion; None if no motion is played."""
         if first is not None and first not in self.names:
             self.names.insert(0, first)
 
     def load(self, name: str) -> tuple[Any, Any]:
-        """Return the motion of a name, and its bone transforms where joints stretch; raises UserError."""
+        """Return a motion by its name, and its bone transforms if joints stretch; raises UserError."""
         if name not in self._loaded:
             chosen = select_motion(self._config, self._config, self._skeleton, None, name)
             self._loaded[name] = chosen.motion, chosen.bone_transforms
@@ -151,7 +151,7 @@ class _Shelf:
 
 
 def _file_names(paths: list[str]) -> list[str]:
-    """Return what files are called on the page, each otherwise: by their paths where the last parts are the same."""
+    """Return a unique name for each file: its file name, or its path where file names are equal."""
     short = [Path(path).name for path in paths]
     return unique_names([
         f"file: {name if name and short.count(name) == 1 else path}" for name, path in zip(short, paths, strict=True)
@@ -159,7 +159,7 @@ def _file_names(paths: list[str]) -> list[str]:
 
 
 def _own_motions(config: ViewConfig, avatar: Avatar) -> list[str]:
-    """Return the motions that need no file: built-in ones, or the sequences of a skeleton's own samples."""
+    """Return the motions that need no file: the built-in ones (SMPL), or the sequences of the samples (other skeletons)."""
     if layout_of(avatar.skeleton) == SMPL:
         return [*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES]
     if config.data.name == "builtin":
@@ -167,14 +167,14 @@ def _own_motions(config: ViewConfig, avatar: Avatar) -> list[str]:
     try:
         store = SampleStore.open(config.data_root, config.data.name, config.subject)
     except UserError:
-        return []  # the avatar alone can be posed as well
+        return []  # without samples the avatar can still be posed
     if (store.skeleton.names, store.skeleton.parents) != (avatar.skeleton.names, avatar.skeleton.parents):
         return []
     return [sequence.name for sequence in store.all_sequences]
 
 
 def _facts(config: ViewConfig, avatar: Avatar, path: Path) -> dict[str, str]:
-    """Return what the page tells about the avatar."""
+    """Return the facts about the avatar that the page shows."""
     settings = avatar.config
     facts = {
         "subject": str(avatar.facts.get("subject", config.subject)),
@@ -191,14 +191,14 @@ def _facts(config: ViewConfig, avatar: Avatar, path: Path) -> dict[str, str]:
 
 
 def _announce(config: ViewConfig, avatar: Avatar, path: Path, port: int) -> None:
-    """Say where the page is, and open it where whoever typed the command would see it."""
+    """Print the address of the page, and open it if the browser runs on this machine's display."""
     name = f"[{config.host}]" if ":" in config.host else config.host
     name = "127.0.0.1" if config.host in ("0.0.0.0", "::") else name
     address = f"http://{name}:{port}"
     log.info("avatar: %s, on %s", path, avatar.device)
-    log.info("page: %s (Ctrl-C ends it)", address)
+    log.info("page: %s (Ctrl-C ends the server)", address)
     if not is_loopback(config.host):
-        log.warning("host=%s: anybody who reaches this machine over the network can see and change the page", config.host)
+        log.warning("host=%s: all machines in the network can see and change the page", config.host)
     if config.open and can_open_browser():
         webbrowser.open(address)
     elif is_loopback(config.host) and (os.environ.get("SSH_CONNECTION") or not can_open_browser()):

@@ -198,7 +198,7 @@ def test_what_is_missing_beside_is_no_missing_frame(config, toy, monkeypatch, ca
 
 def test_truth_is_shown_where_there_is_some(config, toy, tmp_path, monkeypatch):
     toy.facts = {"data": "meshes", "subject": "50002"}
-    with pytest.raises(UserError, match=r"beside=\[truth\]: there is no ground truth of pose files for data=meshes"):
+    with pytest.raises(UserError, match=r"beside=\[truth\]: pose files have no ground truth with data=meshes"):
         run(replace(config, beside=["truth"]))
     solid = trimesh.creation.box((0.4, 0.2, 0.2))
     meshes = [(np.add(solid.vertices, (2 * frame, 1, 0)), solid.faces) for frame in range(6)]
@@ -234,7 +234,7 @@ def test_an_interrupted_run_goes_on(config, toy, monkeypatch, caplog):
     monkeypatch.setattr(animate.Animation, "_extract", extract)
     with caplog.at_level(logging.INFO):
         assert run(config) == 0
-    assert "3 were there already" in caplog.text
+    assert "3 existed already" in caplog.text
     assert not list(folder.glob(".*"))
     assert {name: (folder / name).stat().st_mtime_ns for name in before} == before
     assert len(video_frames(folder / "video.mp4")[1]) == 6
@@ -265,11 +265,11 @@ def test_files_of_others_are_not_deleted(config, tmp_path):
     mine.parent.mkdir()
     mine.write_text("not by this program")
     short = replace(config, max_frames=1, video=False, output=str(mine.parent))
-    with pytest.raises(UserError, match=r"holds frame_0001.ply of unknown origin; give overwrite=true"):
+    with pytest.raises(UserError, match=r"has frame_0001.ply of unknown origin; give overwrite=true"):
         run(short)
     assert mine.exists()
     (mine.parent / "animation.json").write_text("[]")
-    with pytest.raises(UserError, match="is no record of an animation"):
+    with pytest.raises(UserError, match="is not the record of an animation"):
         run(short)
     assert run(replace(short, overwrite=True)) == 0
     assert not mine.exists()
@@ -314,8 +314,8 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"keep_share": 1.5}, "keep_share: wanted 0 to 1, got 1.5"),
         ({"step": 0}, "step: wanted at least 1"),
         ({"max_frames": 0}, "max_frames: wanted at least 1"),
-        ({"start": 6}, "start=6, stop=null leave no frame: wave has frames 0 to 5"),
-        ({"meshes": False, "video": False}, "nothing to make"),
+        ({"start": 6}, "start=6, stop=null leave no frame; wave has frames 0 to 5"),
+        ({"meshes": False, "video": False}, "meshes, video: wanted at least one"),
         ({"video_size": "large"}, "video_size: wanted pixels such as 512 or 1280x720"),
         ({"video_size": "9000"}, "video_size: wanted"),
         ({"video_size": "2000", "views": ["front", "left", "back", "right", "top"]}, "5 panels .* smaller video_size"),
@@ -324,8 +324,8 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"camera": "folow"}, "camera: wanted still or follow, got 'folow'; did you mean 'follow'"),
         ({"turntable": "fast"}, "turntable.* true, false or degrees"),
         ({"beside": ["thruth"]}, "beside: wanted canonical, truth.* got 'thruth'; did you mean 'truth'"),
-        ({"beside": ["field"]}, r"beside=\[field\]: the avatar is shown as surface=field already"),
-        ({"beside": ["weights", "weights"]}, "beside has 'weights' twice"),
+        ({"beside": ["field"]}, r"beside=\[field\]: surface=field shows this already"),
+        ({"beside": ["weights", "weights"]}, "beside: wanted each panel once, got 'weights' twice"),
         ({"processes": "many"}, "processes.* auto or a number from 1 to 64, got 'many'"),
         ({"elevation_deg": 90.0}, "elevation_deg: wanted "),
         ({"pose": None, "motion_frame_rate": 0.0}, "motion_frame_rate: wanted "),

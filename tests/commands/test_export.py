@@ -142,7 +142,7 @@ def test_what_meshes_do_not_use_is_said(folder, capsys, caplog):
     assert export(capsys, *arguments)[0] == 0
     assert "not used" not in caplog.text
     assert export(capsys, *arguments, "influences=8", "morph_targets=0")[0] == 0
-    assert "influences=8, morph_targets=0: not used, meshes of format=ply have all weights" in caplog.text
+    assert "influences=8, morph_targets=0: not used with format=ply, whose meshes have all weights" in caplog.text
 
 
 def test_several_clips_of_meshes_have_a_folder_each(folder, capsys):
@@ -278,7 +278,7 @@ def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
 
     monkeypatch.setattr(SkinnedSurface, "canonical_vertices", sometimes)
     assert export(capsys, "--pose", pose_file("walk.npz", 4))[0] == 1
-    assert "clip walk, frame 1: the shape could not be followed: the field is unoccupied" in caplog.text
+    assert "clip walk, frame 1: the shape could not be computed: the field is unoccupied" in caplog.text
     calls.clear()
     assert export(capsys, "--pose", "walk.npz", "format=ply", "output=out")[0] == 1
     assert sorted(path.name[-5] for path in Path("out").glob("*.ply")) == ["0", "2", "3"]
@@ -293,11 +293,11 @@ def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
         (["triangles=99999999"], "triangles: wanted "),
         (["morph_targets=65"], "morph_targets: wanted 0 to 64, got 65"),
         (["step=0"], "step: wanted at least 1"),
-        (["output=me.fbx"], "output me.fbx should end in .glb; give format=fbx, or give another name"),
-        (["output=me"], "output me should end in .glb; give another name"),
-        (["output=."], "should end in .glb"),
+        (["output=me.fbx"], "output: wanted a name ending in .glb, got me.fbx; give format=fbx, or give another name"),
+        (["output=me"], "output: wanted a name ending in .glb, got me; give another name"),
+        (["output=."], "ending in .glb"),
         (["--pose", "nowhere.npz"], "no pose file at nowhere.npz"),
-        (["--pose"], "--pose needs a value"),
+        (["--pose"], "--pose: wanted a value"),
         (["motion=[jumping_jacks]"], f"motion jumping_jacks is for SMPL's 24 joints, the avatar has {JOINTS}"),
         (["motion=[jumping_jaks]"], "did you mean 'jumping_jacks'"),
         (["subject=50004"], "no avatar in .*50004"),
@@ -366,7 +366,7 @@ def test_blender_gets_a_whole_glb(folder, capsys, fake_blender):
     assert sorted(path.name for path in (folder / "export").iterdir()) == ["50002.fbx", "50002_fbx.json"]
     code, err = export(capsys, "--pose", "walk.npz", "--pose", "walk.npz", "format=usd")
     assert code == 2
-    assert "usd holds one timeline, got 2 motions" in err
+    assert "usd: wanted one motion, got 2" in err
 
 
 @pytest.mark.parametrize("kind", ["fbx", "usd"])

@@ -48,7 +48,7 @@ def test_a_built_in_body_is_known_in_every_pose(subject):
 def test_another_body_or_data_set_has_none(subject):
     chosen = part(subject.sequences[0].motion, [0])
     taller = replace(subject.skeleton, joints_rest=subject.skeleton.joints_rest * 1.1)
-    with pytest.raises(UserError, match="subject 50004 has other joints than the built-in body"):
+    with pytest.raises(UserError, match="the skeleton of avatar 50004 is not that of the built-in body"):
         ground_truth_meshes(CHOICE, PLAIN, avatar_of(taller, data="builtin", subject="50004"), chosen, None)
     other = replace(CHOICE, data=DataConfig("dfaust", 8, 1, 1))
     for pose, what in ((None, "built-in motions"), ("a.npz", "pose files")):

@@ -85,12 +85,12 @@ def test_stretching_joints_are_kept_and_cannot_be_resampled(skeleton, monkeypatc
     chosen = select_motion(replace(PLAIN, start=1, in_place=True), own, other, None, None)
     np.testing.assert_allclose(chosen.bone_transforms[:, :, :3, 3], np.tile([0, 1, 0], (2, 2, 1)), atol=1e-7)
     assert transforms[2, 0, 0, 3] == 1  # what was read is as it was
-    with pytest.raises(UserError, match="frame_rate is for motions whose joints do not stretch, those of run do"):
+    with pytest.raises(UserError, match="frame_rate: wanted a motion whose joints do not stretch, got run"):
         select_motion(replace(PLAIN, frame_rate=60.0), own, other, None, None)
 
 
 def test_what_cannot_be_used_is_refused(skeleton, walk):
-    with pytest.raises(UserError, match="start=90, stop=null leave no frame: walk has frames 0 to 24"):
+    with pytest.raises(UserError, match="start=90, stop=null leave no frame; walk has frames 0 to 24"):
         choose(skeleton, walk, start=90)
     for changes, message in (
         ({"frame_rate": 0.0}, "frame_rate: wanted 1.0 to 1000.0, got 0.0"),

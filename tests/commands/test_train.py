@@ -90,7 +90,7 @@ def test_an_interrupted_run_resumes_to_the_same_avatar(config, monkeypatch, capl
     assert "continue with resume=true" in caplog.text
     assert {path.name for path in folder_of(config).iterdir()} == FILES - {"avatar.pt", "metrics.json"}
     monkeypatch.setattr(Trainer, "advance", advance)
-    with pytest.raises(UserError, match="already holds a run; give resume=true to continue it, overwrite=true"):
+    with pytest.raises(UserError, match="already has a run; give resume=true to continue it, overwrite=true"):
         run(config)
     torch.manual_seed(99)
     run(replace(config, resume=True))

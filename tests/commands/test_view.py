@@ -133,7 +133,7 @@ def test_who_listens_to_all_is_warned(served, opened, caplog):
     with caplog.at_level(logging.WARNING):
         server = served(host="0.0.0.0")
     assert [record.message for record in caplog.records] == [
-        "host=0.0.0.0: anybody who reaches this machine over the network can see and change the page"
+        "host=0.0.0.0: all machines in the network can see and change the page"
     ]
     assert opened == [f"http://127.0.0.1:{server.port}"]
 
@@ -196,10 +196,10 @@ def test_without_viser_one_line_before_any_work(config, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"port": "http"}, "port: wanted a number from 1 to 65535, or auto for any free one, got 'http'"),
+        ({"port": "http"}, "port: wanted a number from 1 to 65535, or auto for any free port, got 'http'"),
         ({"port": "65536"}, "port: wanted a number"),
         ({"port": "-1"}, "port: wanted a number"),
-        ({"host": "203.0.113.7"}, "host 203.0.113.7 is no address of this machine"),
+        ({"host": "203.0.113.7"}, "host: wanted an address of this machine, got 203.0.113.7"),
         ({"surface": "feild"}, "surface: wanted skinned or field, got 'feild'; did you mean 'field'"),
         ({"resolution": 15}, "resolution: wanted 16 to 1024, got 15"),
         ({"step": 0}, "step: wanted at least 1"),

@@ -1,8 +1,8 @@
-"""Preprocessing in frames a second, with the share of each part; the time of a batch against that of a training step.
+"""Frames per second of preprocessing and the share of each part; the time of a batch compared with a training step.
 
     python benchmarks/bm_data.py            needs the samples of `snarf preprocess subject=50002`
 
-Where other programs use the cores too, go by the processor time of a frame and by the ratios.
+On a machine that is shared, compare the processor time per frame and the ratios.
 """
 
 from __future__ import annotations
@@ -23,17 +23,16 @@ from omegaconf import OmegaConf
 from snarfcli.commands.train import TrainConfig, new_trainer
 from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.hydra_config.schema import config_folder, register_schemas
+from snarfcli.parallel import count_cores, run_in_processes
 from snarfcli.samples.preprocessing import preprocess_subject
 from snarfcli.samples.store import SampleStore
 from snarfcli.samples.writing import SequenceWriter
 from snarfcli.sampling import (
     SamplingSettings,
     check_mesh,
-    count_cores,
     dequantise,
     frame_generator,
     quantise,
-    run_in_processes,
     sample_frame,
     surface_samples,
     winding_numbers,
@@ -45,13 +44,13 @@ PARTS_OF = 12  # frames whose parts are timed one by one
 
 
 def processor_s() -> float:
-    """Return the processor time of this process and of all that it has ended, seconds."""
+    """Return the processor time of this process and of its finished child processes, seconds."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(part.ru_utime + part.ru_stime for part in used)
 
 
 def preprocessing(workers: int) -> list[str]:
-    """Preprocess two sequences of the built-in subject; return a row: workers, frames, and what they took."""
+    """Preprocess two sequences of the built-in subject; return a row: workers, frames and times."""
     subject = builtin_subject("50002")
     names = [spec.name for spec in subject.sequences][:2]
     with tempfile.TemporaryDirectory() as root:
@@ -67,7 +66,7 @@ def preprocessing(workers: int) -> list[str]:
 
 
 def parts() -> Iterator[list[str]]:
-    """Yield rows: a part of preprocessing a frame, its processor time, its share of the sum. For a process of its own."""
+    """Yield rows: a part of preprocessing, its processor time per frame, its share. Runs in a separate process."""
     torch.set_num_threads(1)
     spec = builtin_subject("50002").sequences[0]
     frames = np.linspace(0, spec.motion.num_frames - 1, PARTS_OF).round().astype(int)
@@ -117,7 +116,7 @@ def batches(name: str, store: SampleStore, repeats: int) -> list[str]:
         config: TrainConfig = OmegaConf.to_object(compose("train", [f"training={name}", "training.workers=0"]))
     device = torch.device("cpu")
     trainer = new_trainer(config, store, device)
-    for _ in range(30):  # so that the weights are no longer those of the start
+    for _ in range(30):  # so that the weights have left their initial values
         trainer.advance()
     stored, fresh = (kind(store, config.training, 0, device) for kind in (FrameBatches, FreshBatches))
     for step in range(200):  # page cache warm
@@ -144,12 +143,12 @@ def main() -> None:
     require(Path(options.data_root) / "processed/builtin/50002/manifest.json", "snarf preprocess subject=50002")
     print_machine()
     if hasattr(os, "getloadavg"):
-        print(f"running besides this, on average of the last minute: {os.getloadavg()[0]:.1f}")
-    print("\nPreprocessing, 20,000 points a frame, 6,890 vertices")
+        print(f"load average of the last minute: {os.getloadavg()[0]:.1f}")
+    print("\nPreprocessing, 20,000 points per frame, 6,890 vertices")
     rows = [preprocessing(workers) for workers in dict.fromkeys((1, 2, count_cores()))]
-    print_table(["processes", "frames", "frames/s", "processor ms a frame", "bytes a frame"], rows)
+    print_table(["processes", "frames", "frames/s", "processor ms per frame", "bytes per frame"], rows)
     print("\nIts parts, one process")
-    print_table(["part", "processor ms a frame", "share"], [row for _, row in run_in_processes(parts, [()], 1)])
+    print_table(["part", "processor ms per frame", "share"], [row for _, row in run_in_processes(parts, [()], 1)])
     print("\nBatches, made in the training process")
     register_schemas("train", TrainConfig)
     store = SampleStore.open(options.data_root, "builtin", "50002")

@@ -1,4 +1,4 @@
-"""Milliseconds for the posed field at 200,000 points of one frame, search and shape separately, for each search.
+"""Time to evaluate the posed field at 200,000 points of one frame, for each search: search and shape separately.
 
 python benchmarks/bm_evaluation.py          needs `make demo`, or give --avatar and --data-root
 """

@@ -1,4 +1,4 @@
-"""Seconds and memory to extract the posed surface of one frame, field and skinned, at several resolutions.
+"""Time and memory to extract the posed surface of one frame, field and skinned, at several resolutions.
 
     python benchmarks/bm_extraction.py          needs `make demo`, or give --avatar
 
@@ -39,9 +39,9 @@ def main() -> None:
     print_machine()
     print(f"network: {shape.depth} layers of {shape.width}, {shape.activation}; condition: {avatar.config.condition.name}\n")
     rows = [_row(avatar, pose, surface, r, options.repeats) for surface in ("field", "skinned") for r in options.resolutions]
-    with mock.patch.object(system, "can_evaluate", lambda *_: False):
+    with mock.patch.object(system, "can_evaluate", return_value=False):
         rows += [_row(avatar, pose, "field", r, options.repeats, ", network in PyTorch") for r in options.resolutions]
-    print_table(["surface", "resolution", "first, ms", "then, ms a frame", "vertices", "points evaluated"], rows)
+    print_table(["surface", "resolution", "first, ms", "then, ms per frame", "vertices", "points evaluated"], rows)
     if options.memory:
         print()
         rows = [
@@ -54,7 +54,7 @@ def main() -> None:
 
 def _row(avatar: Avatar, pose: torch.Tensor, surface: str, resolution: int, repeats: int, how: str = "") -> list[str]:
     meshes = []
-    avatar.to(avatar.device)  # forgets the canonical meshes
+    avatar.to(avatar.device)  # drops the cached canonical meshes
     start = time.perf_counter()
     avatar.mesh(pose, resolution=resolution, surface=surface)
     first = 1000 * (time.perf_counter() - start)
@@ -69,7 +69,7 @@ def _ball() -> None:
 
 
 def _peak_mib(work) -> str:
-    """Return how far the resident memory of the process rises above its start, looked at every 2 ms."""
+    """Return the growth of the resident memory of the process, sampled every 2 ms."""
     page = os.sysconf("SC_PAGE_SIZE")
 
     def resident() -> int:

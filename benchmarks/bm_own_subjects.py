@@ -1,9 +1,9 @@
-"""Two subjects brought along as a user would, trained and evaluated: a dog as a rigged glTF file, a person as meshes.
+"""Two subjects in files as a user has them, trained and evaluated: a dog as a rigged glTF file, a person as meshes.
 
     python benchmarks/bm_own_subjects.py FOLDER        samples, avatars and results go there; about 15 minutes on two cores
 
 The dog is made in code (tests/toy_animal.py): it walks, trots and sniffs in training, and sits for testing. The person is
-built-in subject 50009, written as one PLY file a frame with a skeleton and poses; jumping jacks are held out.
+built-in subject 50009, written as one PLY file per frame with a skeleton and poses; jumping jacks are held out.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _EVERY = 4  # frames of the person's motions
 
 
 def write_dog(folder: Path) -> None:
-    """Write the dog: one GLB with four animations, and which of them is held out."""
+    """Write the dog: one GLB with four animations, and the name of the one that is held out."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "dog.glb").write_bytes(animal_glb(make_animal(), [animal_motion(clip) for clip in ANIMAL_CLIPS]))
     (folder / "split.json").write_text(json.dumps({"test": [HELD_OUT_CLIP]}))
 
 
 def write_person(folder: Path) -> None:
-    """Write the person: a skeleton, and for each sequence its poses and a mesh a frame."""
+    """Write the person: a skeleton, and for each sequence its poses and one mesh per frame."""
     subject = builtin_subject(_PERSON)
     skeleton = subject.skeleton
     folder.mkdir(parents=True, exist_ok=True)

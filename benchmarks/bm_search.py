@@ -1,12 +1,12 @@
-"""The correspondence searches side by side: how complete they are, and how fast.
+"""Completeness and speed of the correspondence searches.
 
     python benchmarks/bm_search.py                        everything
     python benchmarks/bm_search.py --quick                a minute or two
     python benchmarks/bm_search.py --only time,memory     some parts: completeness, time, scaling, memory, training
     python benchmarks/bm_search.py --out search.md        the tables also as a Markdown file
 
-Completeness is measured against an exhaustive float64 search (tests/deformer/ground_truth.py). In a timing the searches take
-turns round by round, so that their ratios hold on a machine that is not quiet.
+Completeness is measured against an exhaustive float64 search (tests/deformer/ground_truth.py). The searches are timed in
+turns, so that their ratios hold on a busy machine too.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from snarfcli.sampling import winding_numbers
 from ground_truth import GroundTruth, true_roots  # isort: skip (scenes puts its folder on the path)
 
 PARTS = ("completeness", "time", "scaling", "memory", "training")
-SEAM_M = 1e-5  # the complete search's tolerance in a grid of 2 m
+SEAM_M = 1e-5  # the tolerance of the complete search in a grid of 2 m
 
 Scoring = dict[tuple[str, str, str], Scores]
 
 
 class Report:
-    """What is printed, and kept for a file."""
+    """Text that is printed and kept for a file."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -157,7 +157,7 @@ def _cells(s: Scores) -> list[str]:
 
 # ---------------------------------------------------------------------------------------------------- time
 def interleaved(works: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
-    """Return the seconds of `repeats` rounds in which all works take turns, after a round to warm up."""
+    """Return the seconds of `repeats` rounds in which all functions take turns, after one round to warm up."""
     seconds: dict[str, list[float]] = {name: [] for name in works}
     for round_number in range(repeats + 1):
         for name, work in works.items():
@@ -207,7 +207,7 @@ def _work(method: Method, points: Tensor, scene: Scene, active: Tensor | None) -
 
 
 def scaling(report: Report, chosen: list[Method], quick: bool, repeats: int) -> None:
-    """Time our complete search, the first of `chosen`, for growing numbers of queries."""
+    """Time the complete search, the first of `chosen`, for growing numbers of queries."""
     scene = body_scene("arms_behind_back")
     counts = [25_000, 100_000, 400_000] if quick else [25_000 * 2**k for k in range(7)]
     rows = []
@@ -219,7 +219,7 @@ def scaling(report: Report, chosen: list[Method], quick: bool, repeats: int) -> 
                 seconds = interleaved(works, repeats)
                 per_query = (1e9 * statistics.median(seconds[str(n)]) / n for n in counts)
                 rows.append([method.name, kind, cells, *(f"{value:.0f}" for value in per_query)])
-    report.say("## Nanoseconds a query, by the number of queries")
+    report.say("## Nanoseconds per query, by the number of queries")
     report.say(f"{scene.name}, {torch.get_num_threads()} threads, median of {repeats}.")
     report.table(["search", "queries", "cells", *(f"{n // 1000}k" for n in counts)], rows)
 
@@ -259,7 +259,9 @@ def main() -> None:
         scaling(report, timed, quick, repeats)
     if "memory" in parts and Path("/proc/self/clear_refs").exists():
         report.say("## Peak extra memory")
-        report.say("Growth of a process's peak (VmHWM) during one search, results included; each in a process of its own.")
+        report.say(
+            "Growth of the peak memory (VmHWM) of a process during one search, results included; one process per search."
+        )
         which, counts = (timed[:1], (1_000_000,)) if quick else (timed, (1_000_000, 10_000_000))
         report.table(MEMORY_HEADER, memory_rows(which, counts))
     if "training" in parts:

@@ -1,8 +1,8 @@
-"""Milliseconds to evaluate the canonical occupancy network without gradients: natively, and layer by layer in PyTorch.
+"""Time to evaluate the canonical occupancy network without gradients: natively, and layer by layer in PyTorch.
 
     python benchmarks/bm_shape.py
 
-Untrained networks of the papers' and of the quick training's size, the pose condition global and local; all in one run.
+Untrained networks of the sizes of the papers and of the quick training, with global and local pose condition.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Field surface against skinned surface, and both against the true body, in and out of distribution.
+"""Field surface and skinned surface compared with each other and with the true body, in and out of distribution.
 
     python benchmarks/bm_surfaces.py          needs `make demo`, or give --avatar and its --subject
 
 The subject is a built-in one, whose posed body is known. "Buried" is the share of the skinned surface that lies deeper than
-3 mm inside the field: parts that pass into each other where the body touches itself, which the field's union does not have.
+3 mm inside the field: parts that intersect where the body touches itself; the field has none, since it is their union.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def main() -> None:
     header = ["sequence", "split", "field to skinned", "field to truth", "skinned to truth", "buried, % (worst)"]
     print("\nChamfer distances in mm\n")
     print_table(header, rows)
-    print("\nThe skinned surface follows the shape at control points; a vertex motion is one of a frame to the next\n")
+    print("\nThe skinned surface follows the shape at control points; vertex motions are between consecutive frames\n")
     header = ["motion, 40 frames", "interpolated, mm off (99 %)", "vertex motions", "over 5 mm", "if every point were believed"]
     print_table(header, [_following(avatar, skinned, name) for name in ("jumping_jacks", "punching")])
 
@@ -98,7 +98,7 @@ def _compare(
 
 
 def _buried(mesh: Mesh, field: Mesh) -> float:
-    """Return the share of a surface that lies deep inside another, closed one."""
+    """Return the share of a surface that lies deep inside another, closed surface."""
     import igl
 
     points, _ = sample_surface(mesh.vertices, mesh.faces, 20_000, np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""Seconds of one training step and its parts, for each preset.
+"""Time of one training step and its parts, for each preset.
 
 python benchmarks/bm_training.py            needs the samples of `snarf preprocess subject=50002`
 """
@@ -25,7 +25,7 @@ def measure(name: str, search: str, store: SampleStore, steps: int, repeats: int
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config: TrainConfig = OmegaConf.to_object(compose("train", [f"training={name}", f"search={search}"]))
     trainer = new_trainer(config, store, torch.device("cpu"))
-    for _ in range(steps):  # so that the weights are no longer those of the start
+    for _ in range(steps):  # so that the weights have left their initial values
         trainer.advance()
     batch = trainer.batches.batch(0)
     parts: dict[str, list[float]] = {"search": [], "shape": []}

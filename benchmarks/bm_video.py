@@ -1,4 +1,4 @@
-"""Seconds to draw one frame of a video, and frames a second of a whole one on one process and on several.
+"""Time to draw one frame of a video, and frames per second of a whole video on one process and on several.
 
 python benchmarks/bm_video.py               needs `make demo`, or give --avatar
 """
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def _pictures(options, avatar, motion) -> None:
-    """Print what one picture costs, one thread."""
+    """Print the time of one picture on one thread."""
     pose, shift = (torch.from_numpy(values[len(values) // 2]).float() for values in (motion.poses, motion.translation))
     mesh = avatar.skinned_surface(options.resolution).posed(pose, shift)
     size, look = (options.size, options.size), Look()
@@ -65,7 +65,7 @@ def _pictures(options, avatar, motion) -> None:
 
 
 def _videos(options, avatar, motion) -> None:
-    """Print what a video costs: skinned surface, pictures and encoding, with the start of the processes."""
+    """Print the time of a video: skinned surface, pictures and encoding, including the start of the processes."""
     mesh = avatar.skinned_surface(options.resolution).mesh
     cores = count_cores()
     rows = []

@@ -1,4 +1,4 @@
-"""What the benchmarks share: machine, timing with median and spread, and a table."""
+"""Helpers of all benchmarks: options, facts about the machine, timing with median and spread, tables."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def arguments(description: str, **extra: dict) -> argparse.Namespace:
 
 
 def require(path: Path, command: str) -> Path:
-    """Return `path`, or end with a line that says how to make it."""
+    """Return `path`, or exit with a line that says how to make it."""
     if not path.exists():
         raise SystemExit(f"no {path}; make it with: {command}")
     return path
@@ -47,13 +47,13 @@ def timed(work: Callable[[], object], repeats: int) -> list[float]:
 
 
 def median_and_spread(seconds: Sequence[float]) -> str:
-    """Return median, least and most in milliseconds."""
+    """Return median, minimum and maximum in milliseconds."""
     ms = [1000 * value for value in seconds]
     return f"{statistics.median(ms):.1f} ({min(ms):.1f}-{max(ms):.1f})"
 
 
 def print_machine() -> None:
-    """Print the machine and the versions that the figures below belong to."""
+    """Print the machine and the versions that the following numbers belong to."""
     facts = machine_facts()
     machine, versions = facts["machine"], facts["versions"]
     gpu = f", {machine['gpu']}" if "gpu" in machine else ""

@@ -1,11 +1,11 @@
-"""Everything to be known about the CUDA kernels on one GPU: are they right, how fast, how near to what the device can do.
+"""Check and measure the CUDA kernels on one GPU: correctness, speed, share of the bandwidth, memory.
 
-    python benchmarks/gpu_check.py                           all of it, ten minutes; writes benchmarks/results/gpu-<name>.md
-    python benchmarks/gpu_check.py --write-scenes scenes.pt  where all packages are: the body's scenes for another machine,
-    python benchmarks/gpu_check.py --scenes scenes.pt        which then needs no more than PyTorch and NumPy
+    python benchmarks/gpu_check.py                           everything, ten minutes; writes benchmarks/results/gpu-<name>.md
+    python benchmarks/gpu_check.py --write-scenes scenes.pt  with all packages: writes the scenes for another machine,
+    python benchmarks/gpu_check.py --scenes scenes.pt        which then needs only PyTorch and NumPy
 
-In order: compile all kernels (cold and from the cache); run tests/native/test_cuda.py, once plainly and, where there is a
-compute-sanitizer, under its checkers; compare with the CPU library on 200,000 queries a scene; time the searches and the
+In order: compile all kernels (cold and from the cache); run tests/native/test_cuda.py, plainly and, if compute-sanitizer
+is installed, under its checkers; compare with the CPU library on 200,000 queries per scene; time the searches and the
 gradient, alone (in a CUDA graph, by events) and as called from Python, beside the broyden kernel and a Fast-SNARF search in
 PyTorch; time every kernel and compare the bytes it must move with the bandwidth that a plain copy reaches; measure the memory.
 """
@@ -50,12 +50,12 @@ class Case:
 
     name: str
     weights: Tensor
-    """[D, H, W, J]."""
+    """[D, H, W, J], skinning weights."""
     bones: Tensor
-    """[B, J, 4, 4]."""
+    """[B, J, 4, 4], canonical to posed, metres."""
     grid: CanonicalGrid
     points: Tensor
-    """[B, N, 3]."""
+    """[B, N, 3], posed space, metres."""
     active: Tensor | None
     nine: list[int]
     """The released start bones."""
@@ -68,7 +68,7 @@ class Case:
 
     @property
     def cells(self) -> int:
-        """How many cells are searched, over all poses."""
+        """Number of cells that are searched, over all poses."""
         each = (self.shape[0] - 1) * (self.shape[1] - 1) * (self.shape[2] - 1)
         return len(self.bones) * (each if self.active is None else int(self.active.sum()))
 
@@ -84,12 +84,12 @@ class Case:
         return cuda.implicit_backward(gradient, *found[:3], *self.box, *self.points.shape[:2], True, True)
 
     def released(self):
-        with torch.device(self.points.device):  # where its new tensors go
+        with torch.device(self.points.device):  # on which it makes its tensors
             return released_search(self.points, self.bones, self.weights, self.grid, self.nine)
 
 
 class Report:
-    """What is printed, and kept for the file."""
+    """Text that is printed and kept for the file."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -107,7 +107,7 @@ class Report:
 
 # ---------------------------------------------------------------- scenes
 def write_scenes(path: Path) -> None:
-    """Put what the cases need into a file."""
+    """Write the scenes that the cases need into a file."""
     from scenes import NINE_BONES, QUERY_KINDS, body_scene
 
     saved = []
@@ -145,7 +145,7 @@ def cases(path: Path, device: torch.device) -> list[Case]:
     return out
 
 
-# ---------------------------------------------------------------- right?
+# ---------------------------------------------------------------- correctness
 def compile_all(report: Report) -> None:
     """Compile every kernel for this device, without and with the cache."""
     architecture = cuda_compile.architecture_for(torch.cuda.get_device_capability())
@@ -194,7 +194,7 @@ def run_tests(report: Report) -> None:
 
 
 def compare(report: Report, chosen: list[Case]) -> None:
-    """Compare with the CPU library, and two runs with each other."""
+    """Compare the kernels with the CPU library, and two runs with each other."""
     rows = []
     for case in chosen:
         found, again = case.complete(), case.complete()
@@ -221,9 +221,9 @@ def compare(report: Report, chosen: list[Case]) -> None:
     report.table(header, rows)
 
 
-# ---------------------------------------------------------------- fast?
+# ---------------------------------------------------------------- speed
 def by_events(work: Callable[[], object], repeats: int) -> list[float]:
-    """Return milliseconds on the device of each call."""
+    """Return the milliseconds on the device per call."""
     for _ in range(3):
         work()
     marks = [(torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)) for _ in range(repeats)]
@@ -236,7 +236,7 @@ def by_events(work: Callable[[], object], repeats: int) -> list[float]:
 
 
 def in_graph(work: Callable[[], object], repeats: int) -> list[float]:
-    """Return milliseconds on the device of each replay of `work`, recorded once; nothing in it may wait."""
+    """Return the milliseconds on the device per replay of `work` in a CUDA graph; `work` must not synchronise."""
     work()
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
@@ -285,7 +285,7 @@ def timings(report: Report, chosen: list[Case], repeats: int) -> None:
 
 
 class TimedGpu:
-    """A launcher that notes how long each kernel takes."""
+    """A launcher that records the time of each kernel."""
 
     def __init__(self, gpu: cuda_driver.Gpu) -> None:
         self.gpu = gpu
@@ -307,14 +307,14 @@ class TimedGpu:
 
 
 def copy_bandwidth() -> float:
-    """Return the bytes a second that a plain copy reads and writes."""
+    """Return the bytes per second that a plain copy reads and writes."""
     source = torch.empty(1 << 30, dtype=torch.uint8, device="cuda")
     target = torch.empty_like(source)
     return 2 * source.numel() / (statistics.median(by_events(lambda: target.copy_(source), 20)) / 1000)
 
 
 def bandwidth(report: Report, chosen: list[Case], repeats: int) -> None:
-    """Compare each kernel's traffic with what a copy reaches, and the whole search with its floor."""
+    """Compare the traffic of each kernel with a plain copy, and the whole search with its lower bound."""
     peak = copy_bandwidth()
     report.say("## Bandwidth\n")
     report.say(
@@ -380,11 +380,11 @@ def memory(report: Report, chosen: list[Case]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--scenes", type=Path, help="file made by --write-scenes")
-    parser.add_argument("--write-scenes", type=Path, help="only write this file")
+    parser.add_argument("--scenes", type=Path, help="file written by --write-scenes")
+    parser.add_argument("--write-scenes", type=Path, help="write this file and stop")
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--parts", default="compile,tests,compare,time,bandwidth,memory")
-    parser.add_argument("--out", type=Path, help="the report's file")
+    parser.add_argument("--out", type=Path, help="file of the report")
     options = parser.parse_args()
     if options.write_scenes:
         return write_scenes(options.write_scenes)

@@ -1,6 +1,6 @@
-"""The search of the released Fast-SNARF in PyTorch, written from the paper and from what is known of its settings.
+"""The search of the released Fast-SNARF in PyTorch, written from the paper and the known settings of the release.
 
-What differs from `search="broyden"` of this package, and costs accuracy: the start Jacobian is the transpose of the blended 3x3
+Differences to `search="broyden"` of this package, which cost accuracy: the start Jacobian is the transpose of the blended 3x3
 (no gradient of the weights, and no inverse); outside the grid the transforms are zero, so points collapse; J^-1 is the one
 from before the last step; the thresholds are fixed lengths. All queries and starts go through every step together, with
 `grid_sample` for the look-up; those that have converged or diverged leave.
@@ -33,7 +33,7 @@ def released_search(
     Args:
         points: [B, N, 3], posed space, metres.
         bone_transforms: [B, J, 4, 4], canonical to posed.
-        skinning_weights: [D, H, W, J].
+        skinning_weights: [D, H, W, J], at the nodes of the grid.
         grid: box of the nodes.
         init_bones: bones that give a start.
 

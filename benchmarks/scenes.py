@@ -1,4 +1,4 @@
-"""What the correspondence searches are compared on: weight fields, poses, queries and a canonical shape for each."""
+"""Scenes to compare correspondence searches: weight fields, poses, queries and a canonical shape for each."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = ["NINE_BONES", "QUERY_KINDS", "Scene", "body_scene", "field_scene", "s
 NINE_BONES = (0, 1, 2, 4, 5, 16, 17, 18, 19)
 """The released start bones: pelvis, hips, knees, shoulders, elbows."""
 QUERY_KINDS = ("cube", "half near")
-"""`cube`: uniform in the papers' cube. `half near`: half of them so, half within 1 cm (standard deviation) of the surface."""
+"""`cube`: uniform in the papers' cube. `half near`: half uniform, half within 1 cm (standard deviation) of the surface."""
 
 _MARGIN_M = (0.12, 0.12, 0.20)  # as conf/skinning/distilled.yaml
 _NEAR_M = 0.02  # cells this near to the body are active
@@ -58,7 +58,7 @@ class Scene:
     occupied: Callable[[np.ndarray], np.ndarray]
     """Whether canonical points [N, 3] are inside the canonical shape, bool [N]."""
     init_bones: tuple[int, ...]
-    """Nine start bones (fewer where there are not as many)."""
+    """Start bones: nine, or all of a smaller skeleton."""
     mesh: tuple[np.ndarray, np.ndarray] | None = None
     """Vertices [V, 3], metres, and faces of the canonical shape, where it is a mesh."""
 
@@ -69,7 +69,7 @@ class Scene:
         return depth, height, width
 
     def posed(self, canonical: np.ndarray) -> np.ndarray:
-        """Return where forward skinning takes canonical points [N, 3] of the grid, float64."""
+        """Skin canonical points [N, 3] of the grid into posed space, float64."""
         lower, upper = self.grid.lower.double().numpy(), self.grid.upper.double().numpy()
         nodes = blended_nodes(self.weights.numpy(), self.transforms.numpy())
         return field(nodes, self.shape, lower, upper, *locate_cells(canonical, self.shape, lower, upper))[0]
@@ -170,7 +170,7 @@ def _untrained(nodes: Tensor, bones: int, sharpness: float) -> Tensor:
 
 
 def _pose(name: str) -> Tensor:
-    """Return the pose [24, 3] of a built-in motion that bends the joints the most; or one with all joints at random."""
+    """Return the pose [24, 3] of a built-in motion with the strongest bends, or a pose with random joints."""
     if name == "random joints":
         generator = torch.Generator().manual_seed(1)
         return 0.7 * torch.randn(24, 3, generator=generator)

@@ -1,4 +1,4 @@
-"""How the roots of a search compare with the true ones."""
+"""Comparison of the roots of a search with the true roots."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from ground_truth import field as skin_field  # isort: skip
 __all__ = ["MATCH_M", "MISS_KINDS", "Scores", "score"]
 
 MATCH_M = 1e-3
-"""A root is found if one of the search's lies this near, metres; each of the search's counts for one true root only."""
+"""A true root is found if a root of the search is at most this far away, metres; each root of the search counts once."""
 
-_ON_FACE = 2e-4  # of a cell; searches in float32 accept a root so little outside the cell that they found it in
+_ON_FACE = 2e-4  # of a cell: how far outside the cell of its search a float32 root is accepted
 
 MISS_KINDS = ("another root of the query in its cell", "det J changes sign in its cell", "other cells")
-"""Where a missed root lies; the first that fits."""
+"""Places of a missed root; the first that fits is counted."""
 
 
 @dataclass
 class Scores:
-    """Counts of one search, which can be added up over scenes."""
+    """Counts of one search; they can be added up over scenes."""
 
     queries: int = 0
     """Queries that are not on a seam."""
     seams: int = 0
-    """Queries on a seam, left out of everything else."""
+    """Queries on a seam, left out of all other counts."""
     roots: int = 0
     """True roots."""
     found: int = 0
@@ -37,17 +37,17 @@ class Scores:
     positive: int = 0
     """True roots with det J > 0."""
     found_positive: int = 0
-    """Those of them that were found."""
+    """True roots with det J > 0 that were found."""
     duplicates: int = 0
     """Roots beside a true one that another root was matched to."""
     false: int = 0
-    """Roots where there is none."""
+    """Roots without a true root nearby."""
     inside: int = 0
     """Queries inside the shape, by the union over the true roots."""
     wrong: int = 0
-    """Queries that the search's roots put on the other side."""
+    """Queries that the roots of the search label differently."""
     wrong_sets: int = 0
-    """The same with the label of the true root for every root that was matched: what missing and false roots alone do."""
+    """The same with the label of the true root for every matched root: the effect of missing and false roots alone."""
     jacobian_errors: list[np.ndarray] = field(default_factory=list)
     """Relative errors of J^-1 at matched roots, Frobenius norm, to the nearest of those of the cells that meet there."""
     missed: np.ndarray = field(default_factory=lambda: np.zeros((2, len(MISS_KINDS)), np.int64))
@@ -58,7 +58,7 @@ class Scores:
 
 
 def score(found: Found, truth: GroundTruth, scene: Scene, active: np.ndarray | None, true_inside: np.ndarray) -> Scores:
-    """Compare roots with the true ones.
+    """Compare roots with the true roots.
 
     Args:
         found: of the search.
@@ -80,7 +80,7 @@ def score(found: Found, truth: GroundTruth, scene: Scene, active: np.ndarray | N
     inverse = found.jacobian_inverse[use][pair].astype(np.float64)
     errors = _relative(inverse, truth.jacobian_inverse[hit])
     cells = np.array(shape[::-1]) - 1
-    for corner in np.ndindex(2, 2, 2):  # the cells around a root that lies almost on a face: each has a Jacobian of its own
+    for corner in np.ndindex(2, 2, 2):  # the cells around a root that lies almost on a face: each has its own Jacobian
         aside = canonical[pair] + (np.array(corner) * 2 - 1) * _ON_FACE / cells * (upper - lower)
         beside, offset = locate_cells(aside, shape, lower, upper)
         offset += (canonical[pair] - aside) / (upper - lower) * cells
@@ -113,7 +113,7 @@ def score(found: Found, truth: GroundTruth, scene: Scene, active: np.ndarray | N
 
 
 def _relative(inverse: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return how far matrices [M, 3, 3] are from the right ones, [M]."""
+    """Return the distance [M] of matrices [M, 3, 3] from the true ones."""
     return np.linalg.norm(inverse - right, axis=(1, 2)) / np.linalg.norm(right, axis=(1, 2))
 
 
@@ -140,7 +140,7 @@ def _match(query: np.ndarray, canonical: np.ndarray, truth: GroundTruth):
 
 
 def _miss_kinds(truth: GroundTruth, lost: np.ndarray, nodes, shape, lower, upper) -> np.ndarray:
-    """Return the index in `MISS_KINDS` of each lost root."""
+    """Return the index in `MISS_KINDS` of each missed root."""
     key = truth.query * (int(truth.cell.max()) + 1) + truth.cell
     crowded = (np.searchsorted(np.sort(key), key[lost], "right") - np.searchsorted(np.sort(key), key[lost], "left")) > 1
     at = (np.arange(5) + 0.5) / 5

@@ -1,4 +1,4 @@
-"""What a search costs beside its time alone: memory, and its share of a training step. Used by bm_search.py."""
+"""Memory of a search, and its share of a training step. Used by bm_search.py."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ _POSES = ("running_on_spot", "knees", "punching", "hips", "chicken_wings", "jump
 
 
 def memory_rows(chosen: list[Method], counts: tuple[int, ...]) -> list[list[str]]:
-    """Return how far searches of so many queries raise the peak of a process's memory (VmHWM).
+    """Return the growth of the peak memory (VmHWM) of a process by searches of `counts` queries.
 
-    Each runs in a process of its own, in which the C library gives large blocks back as soon as they are freed, so that no
-    memory from before is used again unseen.
+    Each search runs in its own process, in which the C library returns large blocks as soon as they are freed, so that reused
+    memory does not hide a part of the growth.
     """
     rows, environment = [], os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
     for method in (m for m in chosen if m.uses_cells or "9 start bones, native" in m.name):
@@ -54,7 +54,7 @@ def memory_rows(chosen: list[Method], counts: tuple[int, ...]) -> list[list[str]
 
 
 def _probe(request: str) -> None:
-    """Run one search and print how far it raised the peak of this process's memory."""
+    """Run one search and print the growth of the peak memory of this process."""
     name, kind, cells, count = json.loads(request)
     torch.set_num_threads(min(2, torch.get_num_threads()))
     scene = body_scene("arms_behind_back")
@@ -100,7 +100,7 @@ def training_rows(chosen: list[Method], resolution: tuple[int, int, int], repeat
 
 
 class _Step:
-    """A training step of the papers' networks, on weights that stay those of the body, as after training."""
+    """A training step with the networks of the papers; the skinning weights stay those of the body, as after training."""
 
     def __init__(self, resolution: tuple[int, int, int], scene: Scene, points: Tensor, transforms: Tensor) -> None:
         from hydra import compose, initialize_config_dir

@@ -1,4 +1,4 @@
-"""The correspondence searches that the benchmark compares, called alike."""
+"""The correspondence searches that the benchmark compares, behind one interface."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ _BROYDEN_M = {"tolerance": 1e-4, "divergence": 0.5}  # the released thresholds, 
 
 @dataclass(frozen=True)
 class Method:
-    """One search."""
+    """A search to compare."""
 
     name: str
     run: Callable
     """`run(points [B, N, 3], bone_transforms [B, J, 4, 4], scene, active cells or None)`."""
     uses_cells: bool = False
-    """Whether it can be told where to look; the others ignore the active cells."""
+    """Whether it searches only the active cells; other searches ignore them."""
     has_gradient: bool = True
-    """Whether its result is differentiable."""
+    """Whether the result is differentiable."""
     timed: bool = True
-    """Whether it takes part in the timings."""
+    """Whether it is part of the timings."""
 
 
 @dataclass
 class Found:
-    """What a search returned for N queries of one pose."""
+    """Result of a search for N queries of one pose."""
 
     canonical: np.ndarray
     """[M, 3], metres."""
@@ -46,7 +46,7 @@ class Found:
 
 
 def methods(names: str | None = None) -> list[Method]:
-    """Return the searches that can be run here, ours first; of them those whose names contain one of `names` (a, b, c)."""
+    """Return the searches that can run here, those of this package first; `names` (a, b, c) selects by parts of their names."""
     native = ["native"] if native_library() is not None else []
     found = [Method(f"complete, {backend}", _ours(backend), True) for backend in [*native, "reference"]]
     found += [Method(f"complete, {backend}, float64", _in_float64(_ours(backend)), True, timed=False) for backend in native]

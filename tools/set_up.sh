@@ -1,7 +1,7 @@
 #!/bin/sh
 # Make the virtual environment $1 (with $PYTHON) and install snarf into it, with what its tests need.
-# A PyTorch that is there already stays as it is. Where there is none, a machine with an NVIDIA driver gets the default
-# build, and any other one the CPU build, which spares it gigabytes of CUDA.
+# An installed PyTorch is kept. Otherwise a machine with an NVIDIA driver gets the default build, and any other the CPU build,
+# which is gigabytes smaller. No newer pip is needed than the one that Python brings.
 set -eu
 venv=$1
 python=${PYTHON:-python3}
@@ -16,7 +16,7 @@ python=${PYTHON:-python3}
 pip="$venv/bin/python -m pip --disable-pip-version-check"
 if ! "$venv/bin/python" -c 'import torch' 2>/dev/null; then
     if [ "$(uname -s)" = Linux ] && ! command -v nvidia-smi >/dev/null 2>&1; then
-        # First from wherever pip is set up to look, then from PyTorch's own index of CPU builds.
+        # First from the configured package index, then from PyTorch's index of CPU builds.
         $pip install --quiet 'torch==2.13.0+cpu' 2>/dev/null ||
             $pip install --quiet 'torch==2.13.0' --index-url https://download.pytorch.org/whl/cpu
     else
@@ -24,7 +24,7 @@ if ! "$venv/bin/python" -c 'import torch' 2>/dev/null; then
     fi
 fi
 $pip install --quiet --editable '.[test]'
-# Readers of glTF that are not ours, for the tests, which are skipped without them: npm or the network may be missing.
+# Independent readers of glTF for the tests. The tests are skipped without them: npm or the network may be missing.
 readers=build/readers
 if command -v npm >/dev/null 2>&1 && ! cmp -s tests/readers/package.json $readers/package.json; then
     mkdir -p $readers.new && cp tests/readers/package.json $readers.new/ &&

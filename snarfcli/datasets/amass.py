@@ -1,4 +1,4 @@
-"""AMASS archives: finding sequences in whatever folders they were unpacked to, and the person they are of."""
+"""Find sequences of AMASS in any folder layout, and read the body of their subject."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,23 +31,23 @@ __all__ = [
     "walk_files",
 ]
 
-_DEPTH = 7  # archives unpack to at most three folders, which people put into folders of their own
+_DEPTH = 7  # archives unpack to at most three nested folders, which are often inside further folders
 _LEFT_OUT = {
-    "processed", "outputs",  # ours
-    "mosh", "mpi_mosh", "mpimosh",  # in AMASS too, with people and exercises of DFaust's names: 50002/jumping_jacks_poses.npz
+    "processed", "outputs",  # written by snarf
+    "mosh", "mpi_mosh", "mpimosh",  # in AMASS too, with names as in DFaust: 50002/jumping_jacks_poses.npz
 }  # fmt: skip
 _KINDS = ("_poses", "_stageii")
-"""How files of the older (SMPL-H) and of the newer release (SMPL-X) end; the papers used the older."""
+"""Ends of the file names of the older (SMPL-H) and the newer release (SMPL-X); the papers used the older."""
 
 
 @lru_cache(maxsize=1)
 def papers_split() -> dict:
-    """Return the papers' split: `dfaust` by subject, and `poseprior`."""
-    return OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("dfaust_split.yaml")))  # type: ignore[return-value]
+    """Return the split of the papers: `dfaust` by subject, and `poseprior`."""
+    return cast(dict, OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("dfaust_split.yaml"))))
 
 
 def walk_files(root: Path, suffix: str = ".npz") -> Iterator[Path]:
-    """Yield the files with a suffix at or below a folder, in a fixed order; links are followed, up to seven folders deep."""
+    """Yield the files with a suffix, at most seven folders deep, in a fixed order; links are followed."""
     for folder, names, files in os.walk(root, followlinks=True):
         depth = len(Path(folder).relative_to(root).parts)
         wanted = (name for name in names if name.lower() not in _LEFT_OUT and not name.startswith("."))
@@ -57,12 +58,12 @@ def walk_files(root: Path, suffix: str = ".npz") -> Iterator[Path]:
 
 
 def find_sequences(root: Path, subject: str, names: Iterable[str]) -> dict[str, Path]:
-    """Return the AMASS files of a subject's sequences that are somewhere below a folder, by name.
+    """Return the AMASS files of a subject's sequences anywhere below a folder, by name.
 
-    A file counts as the subject's if its name starts with the subject's (`DFaust_67/50002/50002_hips_poses.npz`,
-    `DFaust/50002/50002_hips_stageii.npz`) or, where there are none of these, if it lies in a folder of the subject's name
-    (`MPI_Limits/03099/op2_poses.npz`): other archives have folders of the same name.
-    Of several files of one sequence the older release (SMPL-H) comes first, then the one in fewer folders.
+    A file belongs to the subject if its name starts with that of the subject (`DFaust_67/50002/50002_hips_poses.npz`,
+    `DFaust/50002/50002_hips_stageii.npz`). Only if there are no such files, the name of its folder counts
+    (`MPI_Limits/03099/op2_poses.npz`), since other archives have folders of the same name. If there are several files of one
+    sequence, the older release (SMPL-H) is preferred, then the less deep path.
     """
     wanted = "|".join(map(re.escape, names))
     pattern = re.compile(rf"({re.escape(subject)}_)?({wanted})({'|'.join(_KINDS)})\.npz", re.IGNORECASE)
@@ -77,7 +78,7 @@ def find_sequences(root: Path, subject: str, names: Iterable[str]) -> dict[str, 
 
 
 def find_subjects(root: Path, subjects: Iterable[str]) -> tuple[str, ...]:
-    """Return which of some subjects have AMASS files below a folder."""
+    """Return those of the given subjects that have AMASS files below a folder."""
     there: set[str] = set()
     for path in walk_files(root):
         if path.stem.lower().endswith(_KINDS):
@@ -87,35 +88,35 @@ def find_subjects(root: Path, subjects: Iterable[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class AmassSubject:
-    """Whose motions they are: a body model in this person's shape."""
+    """A body model in the shape of one subject of AMASS."""
 
     body: Body
     betas: NDArray[np.float64]
     """[S], shape parameters."""
     skeleton: Skeleton
     sources: tuple[str, ...]
-    """Which files were taken."""
+    """The files that were read, for the manifest."""
 
 
 def read_amass_subject(files: Mapping[str, Path], request: DataRequest) -> AmassSubject:
-    """Return the person of some sequences: shape and gender from `shape.npz` beside them or from a sequence, and the body.
+    """Return the subject of some sequences: shape and gender from `shape.npz` beside them or from a sequence, and the body.
 
     Raises:
-        UserError: there is no body model of this gender, `shape.npz` cannot be used, or, without one, none of the sequences.
+        UserError: there is no body model of this gender, or `shape.npz`, or without one all sequences, cannot be used.
     """
     beside = [path.parent / "shape.npz" for path in files.values() if (path.parent / "shape.npz").is_file()]
     shape, gender, betas = _first_shape(beside[:1] or list(files.values()))
     path = find_body(request.body or request.data_root, "smpl", gender)
     body = load_body(path)
     betas = betas[: min(len(betas), _SMPL_BETAS, body.num_betas)]
-    # SMPL-X has a shape space of its own
-    caution = " (meant for SMPL-X: on SMPL's body another build)" if shape.stem.lower().endswith("_stageii") else ""
+    # The shape space of SMPL-X differs from that of SMPL.
+    caution = " (made for SMPL-X: gives another shape with SMPL)" if shape.stem.lower().endswith("_stageii") else ""
     sources = (f"body {path} ({gender})", f"shape {shape}{caution}", f"motions {next(iter(files.values())).parent}")
     return AmassSubject(body, betas, body.skeleton(betas), sources)
 
 
 def _first_shape(files: Sequence[Path]) -> tuple[Path, str, NDArray[np.float64]]:
-    """Return the first file that says whose body it is about, and gender and shape; a broken recording hides no other."""
+    """Return the first readable file, and its gender and shape; damaged files are skipped if another can be read."""
     problem = None
     for file in files:
         try:
@@ -131,22 +132,23 @@ _SMPL_BETAS = 10  # the papers use the first ten
 def amass_sequences(
     files: Mapping[str, Path], splits: Mapping[str, Split], person: AmassSubject, hands: str, where: Path
 ) -> tuple[list[SequenceSpec], list[tuple[str, str]]]:
-    """Read sequences without their translation, as the papers do.
+    """Read sequences without their translation, as in the papers.
 
     Args:
-        files: those that were found, by name.
-        splits: what each wanted sequence is for, by name.
-        person: whose they are.
+        files: the files by name of the sequence.
+        splits: the split of each wanted sequence, by name.
+        person: the subject.
         hands: see `read_motion`.
-        where: where the files were looked for.
+        where: folder that was searched, for messages.
 
     Returns:
-        The sequences, and those that are missing or cannot be read, with the reason.
+        sequences: the sequences that were read.
+        broken: name and reason of each sequence that is missing or cannot be read.
     """
     sequences, broken = [], []
     for name, split in splits.items():
         if name not in files:
-            broken.append((name, f"there is no file of it below {where}"))
+            broken.append((name, f"has no file below {where}"))
             continue
         try:
             motion = read_motion(files[name], person.skeleton, up="z", hands=hands)

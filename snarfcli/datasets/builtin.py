@@ -1,4 +1,4 @@
-"""The built-in subject set: ten people with DFaust's ids, each with a shape and a way of moving of their own."""
+"""The built-in data set: ten subjects with DFaust's ids, each with its shape and style of motion."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ HELD_OUT_SEQUENCES = {
     "50026": "one_leg_loose",
     "50027": "punching",
 }
-"""The sequence of each subject that is kept for testing, as in the split of SNARF and Fast-SNARF."""
+"""The test sequence of each subject, as in the split of SNARF and Fast-SNARF."""
 
 BUILTIN_SUBJECTS = tuple(HELD_OUT_SEQUENCES)
-"""Ids of the built-in subjects, which are DFaust's."""
+"""Ids of the built-in subjects, those of DFaust."""
 
 _SEQUENCES_PER_SUBJECT = 10
 _NUM_BETAS = 10
@@ -39,7 +39,7 @@ _GENDER = "neutral"
 
 
 def _betas(subject: str, count: int) -> NDArray[np.float64]:
-    # Standard normal is what the shape space is scaled to; 0.9 and the clip keep everyone an ordinary adult.
+    # The shape space is scaled to the standard normal distribution; 0.9 and the clip give ordinary adults.
     return np.clip(0.9 * np.random.default_rng([int(subject), 1]).standard_normal(count), -2.0, 2.0)
 
 
@@ -50,7 +50,7 @@ def _leg_length(body: Body, betas: NDArray[np.float64] | None) -> float:
 
 
 def _sequence_names(subject: str) -> tuple[str, ...]:
-    """Return the subject's ten sequences in TRAINING_SEQUENCES' order, the held-out one among them."""
+    """Return the ten sequences of a subject, including the held-out one, in the order of TRAINING_SEQUENCES."""
     held_out = HELD_OUT_SEQUENCES[subject]
     others = [name for name in TRAINING_SEQUENCES if name != held_out]
     chosen = np.random.default_rng([int(subject), 2]).permutation(others)[: _SEQUENCES_PER_SUBJECT - 1]
@@ -58,14 +58,14 @@ def _sequence_names(subject: str) -> tuple[str, ...]:
 
 
 def require_subject(subject: str) -> None:
-    """Refuse an id that is none of `BUILTIN_SUBJECTS`, with the nearest one.
+    """Check the id of a built-in subject.
 
     Raises:
-        UserError: it is none.
+        UserError: it is not in `BUILTIN_SUBJECTS`.
     """
     if subject not in HELD_OUT_SEQUENCES:
         hint = nearest(subject, BUILTIN_SUBJECTS) or "."
-        raise UserError(f"no built-in subject '{subject}'{hint} Known are {', '.join(BUILTIN_SUBJECTS)}")
+        raise UserError(f"no built-in subject '{subject}'{hint} Wanted one of {', '.join(BUILTIN_SUBJECTS)}")
 
 
 def subjects(request: DataRequest) -> tuple[str, ...]:
@@ -74,7 +74,7 @@ def subjects(request: DataRequest) -> tuple[str, ...]:
 
 
 def load(subject: str, request: DataRequest) -> SubjectData:
-    """Make one of the built-in subjects, with the built-in body or with the one that was asked for."""
+    """Return a built-in subject with the built-in body or the requested one."""
     if request.body is None:
         return builtin_subject(subject)
     require_subject(subject)
@@ -83,31 +83,32 @@ def load(subject: str, request: DataRequest) -> SubjectData:
 
 
 def builtin_subject(subject: str | int, body: Body | None = None, source: str = "") -> SubjectData:
-    """Make one of the built-in subjects: always the same one for the same id.
+    """Return a built-in subject; the result depends only on the arguments.
 
     Args:
         subject: one of `BUILTIN_SUBJECTS`.
-        body: an SMPL body to put in the place of the built-in one.
-        source: where that body is from.
+        body: an SMPL body instead of the built-in one.
+        source: origin of that body, for the manifest.
 
     Raises:
-        UserError: there is no such subject; the message names the nearest valid id.
+        UserError: there is no such subject, or the body does not have SMPL's joints.
     """
     subject = str(subject)
     require_subject(subject)
     body = body or builtin_body()
     if body.joint_names != SMPL_JOINT_NAMES:
-        raise UserError(f"the built-in motions are for SMPL's 24 joints, the body has {body.num_joints}; give an SMPL body")
+        raise UserError(f"body: wanted SMPL's 24 joints for the built-in motions, got {body.num_joints}; give an SMPL body")
     betas = _betas(subject, min(body.num_betas, _NUM_BETAS))
     held_out = HELD_OUT_SEQUENCES[subject]
     names = _sequence_names(subject)
     splits: list[tuple[str, Split]] = [(name, "train") for name in names if name != held_out]
-    splits += [(held_out, "test"), *((name, "ood") for name in OUT_OF_DISTRIBUTION_SEQUENCES)]
+    splits.append((held_out, "test"))
+    splits.extend((name, "ood") for name in OUT_OF_DISTRIBUTION_SEQUENCES)
     size = _leg_length(body, betas) / _leg_length(body, None)
     sequences = []
     for name, split in splits:
         motion = builtin_motion(name, int(subject))
-        # Steps and hops grow with the legs, so that this person's feet stay on this person's floor.
+        # Steps and hops are scaled by the length of the legs, so that the feet stay on the floor.
         motion = replace(motion, translation=motion.translation * size)
         sequences.append(body_sequence(name, split, motion, body, betas))
     skeleton = body.skeleton(betas)

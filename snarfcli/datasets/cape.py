@@ -1,6 +1,6 @@
-"""CAPE: sequences of registered meshes of clothed people, one file a frame, with SMPL's topology.
+"""CAPE: sequences of registered meshes of clothed people, one file per frame, with SMPL's topology.
 
-A subject here is a person in one outfit, such as `00032_longshort`. The layout is that of the archive:
+A subject here is one person in one outfit, such as `00032_longshort`. The layout is that of the archive:
 
     cape_release/sequences/00032/longshort_hips/*.npz     v_posed (6890, 3), pose (72,), transl (3,)
     cape_release/minimal_body_shape/00032/00032_minimal.npy
@@ -38,7 +38,7 @@ _JOINTS = 24
 
 
 def subjects(request: DataRequest) -> tuple[str, ...]:
-    """Return the subjects that are there, such as `00032_longshort`.
+    """Return the available subjects, such as `00032_longshort`.
 
     Raises:
         UserError: there are none.
@@ -54,7 +54,7 @@ def load(subject: str, request: DataRequest) -> SubjectData:
     """Return one person in one outfit; frames that cannot be read are left out and listed.
 
     Raises:
-        UserError: the subject is not there, or its gender, minimal body or body model.
+        UserError: the subject, its gender, its minimal body or its body model is missing.
     """
     release = _release(request)
     person, outfit = _person_and_outfit(subject, subjects(request))
@@ -89,40 +89,40 @@ def _release(request: DataRequest) -> Path:
 
 
 def _person_and_outfit(subject: str, known: Sequence[str]) -> tuple[str, str]:
-    """Return the two parts of a subject's name; a person's number alone will do for one outfit."""
+    """Return the two parts of a subject's name; the outfit may be omitted if the person has only one."""
     number, _, outfit = subject.partition("_")
     number = number.zfill(5) if number.isdigit() else number
     matches = [name for name in known if name == f"{number}_{outfit}" or (not outfit and name.startswith(f"{number}_"))]
     if len(matches) != 1:
-        several = f"subject {subject} wears {', '.join(matches)}; name one" if matches else ""
+        several = f"subject {subject}: wanted one outfit, got {', '.join(matches)}; name one" if matches else ""
         raise UserError(several or f"no CAPE subject '{subject}'{nearest(subject, known)}; there is {', '.join(known)}")
     person, _, outfit = matches[0].partition("_")
     return person, outfit
 
 
 def _minimal_body(person: str, release: Path, request: DataRequest) -> tuple[Body, tuple[str, ...]]:
-    """Return the SMPL body of a person, with the person's scanned minimal shape as template, and which files were taken."""
+    """Return the SMPL body of a person, with the scanned minimal shape as template, and the files that were read."""
     genders_file = release / "misc" / "subj_genders.pkl"
     genders = read_pickle(genders_file, "list of genders")
     gender = genders.get(person) if isinstance(genders, dict) else None
     gender = gender.decode("latin1", "replace") if isinstance(gender, bytes) else gender
     if gender not in ("male", "female", "neutral"):
-        raise UserError(f"{genders_file} says no gender of {person} (male, female or neutral); unpack the archive again")
+        raise UserError(f"{genders_file}: wanted male, female or neutral for {person}, got none; unpack the archive again")
     path = find_body(request.body or request.data_root, "smpl", gender)
     body = load_body(path)
     if body.num_joints != _JOINTS:
-        raise UserError(f"body {path} has {body.num_joints} joints, CAPE's poses are for SMPL's {_JOINTS}; give body=FILE")
+        raise UserError(f"body {path}: wanted SMPL's {_JOINTS} joints for CAPE, got {body.num_joints}; give body=FILE")
     minimal_file = release / "minimal_body_shape" / person / f"{person}_minimal.npy"
     minimal = read_npy(minimal_file, "minimal body")
     if minimal.shape != tuple(body.v_template.shape) or minimal.dtype.kind != "f" or not np.isfinite(minimal).all():
-        wanted = list(body.v_template.shape)
-        raise UserError(f"minimal body {minimal_file} must be finite numbers of shape {wanted}, got {list(minimal.shape)}")
+        wanted = f"finite numbers of shape {list(body.v_template.shape)}"
+        raise UserError(f"minimal body {minimal_file}: wanted {wanted}, got {list(minimal.shape)}; unpack the archive again")
     body = replace(body, v_template=torch.as_tensor(minimal).to(body.v_template))
     return body, (f"body {path} ({gender})", f"minimal body {minimal_file}")
 
 
 def _sequence(name: str, split: Split, folder: Path, body: Body, step: int) -> SequenceSpec:
-    """Read every `step`-th frame of a sequence once, to know which can be used."""
+    """Read every `step`-th frame of a sequence once, to find those that can be used."""
     paths = sorted(folder.glob("*.npz"))
     poses = np.zeros((max(len(paths), 1), body.num_joints, 3))
     usable, reasons = [], []
@@ -133,7 +133,7 @@ def _sequence(name: str, split: Split, folder: Path, body: Body, step: int) -> S
         except UserError as error:
             reasons.append(str(error))
     if not usable:
-        raise UserError(reasons[0] if reasons else f"{folder} holds no .npz file")
+        raise UserError(reasons[0] if reasons else f"{folder} has no .npz file; unpack the archive again")
     if reasons:
         more = f" ({reasons[0]}{', ...' if len(reasons) > 1 else ''})"
         counts = len(reasons), len(usable) + len(reasons)

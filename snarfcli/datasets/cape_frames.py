@@ -1,4 +1,4 @@
-"""The registered meshes of CAPE, one file a frame. Worker processes import this file, so it does without PyTorch."""
+"""Read the registered meshes of CAPE, one file per frame. Worker processes import this file, so it does not import PyTorch."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _FRAME_SHAPES = {"v_posed": (None, 3), "pose": (72,), "transl": (3,)}
 
 @dataclass(frozen=True, eq=False)
 class CapeMeshes:
-    """The registered meshes of one sequence, at the origin: without the recording's translation."""
+    """The registered meshes of one sequence at the origin, without the recorded translation."""
 
     paths: Sequence[Path]
-    """T files."""
+    """T files, one per frame."""
     faces: NDArray[np.int32]
-    """[F, 3], SMPL's."""
+    """[F, 3], faces of SMPL."""
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -51,7 +51,7 @@ class CapeMeshes:
 
 
 def read_cape_frame(path: Path, num_vertices: int) -> dict[str, NDArray[np.float64]]:
-    """Return `v_posed` [V, 3] and `transl` [3], metres, and `pose` [72], radians, of one frame's file.
+    """Return `v_posed` [V, 3] and `transl` [3], metres, and `pose` [72], radians, of one frame.
 
     Raises:
         UserError: the file cannot be read, lacks an array, or one does not fit.
@@ -63,5 +63,6 @@ def read_cape_frame(path: Path, num_vertices: int) -> dict[str, NDArray[np.float
             raise UserError(f"CAPE frame {path} has no '{name}'; wanted {', '.join(_FRAME_SHAPES)}; unpack the archive again")
         array = arrays[name]
         if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
-            raise UserError(f"CAPE frame {path}: {name} must be finite numbers of shape {list(shape)}, got {list(array.shape)}")
+            wanted = f"finite numbers of shape {list(shape)}"
+            raise UserError(f"CAPE frame {path}: {name}: wanted {wanted}, got {list(array.shape)}; unpack the archive again")
     return {name: arrays[name].astype(np.float64) for name in _FRAME_SHAPES}

@@ -1,7 +1,7 @@
-"""The built-in subjects in clothes of their own: the same ids, motions and splits, and folds that come and go with the pose.
+"""The built-in subjects in clothes: the same ids, motions and splits, with folds that depend on the pose.
 
-The template is the body below the clothes in the canonical pose, as CAPE's registrations have SMPL's below theirs: a system
-that needs a skinned base mesh gets the bare one.
+The template is the body below the clothes in the canonical pose, as in CAPE: a system that needs a skinned base mesh gets the
+body without clothes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def subjects(request: DataRequest) -> tuple[str, ...]:
 
 
 def load(subject: str, request: DataRequest) -> SubjectData:
-    """Dress one of the built-in subjects, with the built-in body or with the one that was asked for."""
+    """Return a built-in subject in clothes, with the built-in body or the requested one."""
     if request.body is None:
         return clothed_subject(subject)
     require_subject(subject)
@@ -39,7 +39,7 @@ def load(subject: str, request: DataRequest) -> SubjectData:
 
 
 def outfit_of(subject: str) -> Outfit:
-    """Return what a built-in subject wears: always the same."""
+    """Return the outfit of a built-in subject; it depends only on the id."""
     random = np.random.default_rng([int(subject), 4])
     has_long_legs, has_long_sleeves = divmod(BUILTIN_SUBJECTS.index(subject) % 4, 2)
     return Outfit(
@@ -52,12 +52,12 @@ def outfit_of(subject: str) -> Outfit:
 
 
 def clothed_subject(subject: str | int, body: Body | None = None, source: str = "") -> SubjectData:
-    """Make one of the built-in subjects in clothes: always the same for the same id.
+    """Return a built-in subject in clothes; the result depends only on the arguments.
 
     Args:
         subject: one of the built-in ids.
-        body: an SMPL body to put in the place of the built-in one.
-        source: where that body is from.
+        body: an SMPL body instead of the built-in one.
+        source: origin of that body, for the manifest.
 
     Raises:
         UserError: there is no such subject, or the body does not fit the motions.
@@ -70,16 +70,16 @@ def clothed_subject(subject: str | int, body: Body | None = None, source: str = 
         sequences.append(replace(sequence, meshes=ClothedMeshes(clothed, sequence.meshes.poses, sequence.meshes.translation)))
     outfit = outfit_of(bare.subject)
     lengths = ["long" if share > 0.5 else "short" for share in (outfit.sleeve, outfit.leg)]
-    clothes = f"clothes made to measure: a shirt with {lengths[0]} sleeves, {lengths[1]} trousers"
+    clothes = f"clothes fitted to the body: a shirt with {lengths[0]} sleeves, {lengths[1]} trousers"
     return replace(bare, data="clothed", sequences=tuple(sequences), sources=(*bare.sources, clothes))
 
 
 class ClothedBody:
-    """A person in clothes, in any pose. The clothes are made when the first pose is asked for, in some seconds.
+    """A subject in clothes, in any pose. The clothes are computed at first use, which takes some seconds.
 
     Args:
-        body: the body's model.
-        bare: the person without clothes.
+        body: the body model.
+        bare: the subject without clothes.
     """
 
     def __init__(self, body: Body, bare: SubjectData) -> None:
@@ -108,14 +108,14 @@ class ClothedBody:
         height = folds.displacement(self.turned(poses))
         vertices = np.empty((len(poses), len(rest), 3))
         corrected = self._correctives(poses) - self._correctives(skeleton.canonical_pose.numpy()[None])
-        for index in range(len(poses)):  # one at a time: the transforms of many vertices are large
+        for index in range(len(poses)):  # one at a time, since the transforms of all vertices are large
             blended = blend_transforms(weights, posed_from_rest[index])
             local = rest + mesh.follow(corrected[index]) + facing * height[index, :, None]
             vertices[index] = transform_points(blended, local)
         return vertices if translation is None else vertices + np.asarray(translation)[:, None]
 
     def turned(self, poses: NDArray) -> NDArray[np.float64]:
-        """Return the rotations [B, J, 3, 3] of the joints from the canonical pose, in their parents' axes."""
+        """Return the rotations [B, J, 3, 3] of the joints from the canonical pose, in the axes of their parents."""
         from_rest = axis_angle_to_matrix(torch.as_tensor(poses, dtype=torch.float64))
         canonical = axis_angle_to_matrix(self.bare.skeleton.canonical_pose.to(torch.float64))
         return (from_rest @ canonical.transpose(-1, -2)).numpy()
@@ -136,12 +136,21 @@ class ClothedBody:
         return self._kept
 
     def _make(self) -> tuple[ClothedMesh, NDArray, NDArray, NDArray, Folds]:
-        """Return the mesh, its weights [V, J], at rest its vertices and the directions of its folds [V, 3], and the folds."""
+        """Compute the garment.
+
+        Returns:
+            mesh: cloth and skin in the canonical pose.
+            weights: [V, J], skinning weights.
+            rest: [V, 3], vertices in the rest pose, metres.
+            facing: [V, 3], directions in which folds move the vertices, rest pose.
+            folds: the folds.
+        """
         skeleton, template = self.bare.skeleton, self.bare.template
+        assert template is not None  # built-in subjects have one
         joints = dict(zip(skeleton.names, skeleton.canonical_joints.to(torch.float64).numpy(), strict=True))
         mesh = dress(template.vertices, template.faces, joints, outfit_of(self.bare.subject))
         weights = mesh.follow(template.weights)
-        # Away from what is followed: like a normal, but smooth at hems, too.
+        # Away from the body vertices that are followed: like a normal, but also smooth at hems.
         away = mesh.vertices - mesh.follow(template.vertices)
         facing = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
         folds = place_folds(mesh.vertices, facing, mesh.stand_off_m, joints, int(self.bare.subject))
@@ -152,10 +161,10 @@ class ClothedBody:
 
 
 class ClothedMeshes:
-    """A person in clothes in the poses of a motion; posed when frames are chosen.
+    """A subject in clothes in the poses of a motion; posed when frames are chosen.
 
     Args:
-        clothed: the person.
+        clothed: the subject.
         poses: [T, J, 3], axis-angle, radians.
         translation: [T, 3], metres.
     """

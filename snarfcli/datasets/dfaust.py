@@ -1,4 +1,4 @@
-"""DFaust from AMASS: the papers' subjects and split, with PosePrior's sequences out of distribution where they are there.
+"""DFaust from AMASS: the subjects and split of the papers; PosePrior's sequences, if present, are out of distribution.
 
 Targets are posed SMPL bodies; soft-tissue motion (dmpls) is left out (SNARF Sec. 4.1).
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 from snarfcli.checks import check_choice
 from snarfcli.datasets.amass import amass_sequences, find_sequences, find_subjects, papers_split, read_amass_subject
 from snarfcli.datasets.request import DataRequest
-from snarfcli.datasets.splits import Split
+from snarfcli.datasets.splits import Split, same_split
 from snarfcli.datasets.subjects import SubjectData, body_template
 from snarfcli.errors import UserError, nearest
 from snarfcli.motions.layouts import HANDS
@@ -22,10 +22,10 @@ log = logging.getLogger(__name__)
 
 
 def subjects(request: DataRequest) -> tuple[str, ...]:
-    """Return the ids of the papers' subjects that are there.
+    """Return the ids of the papers' subjects that have files.
 
     Raises:
-        UserError: none is.
+        UserError: there are none.
     """
     known = tuple(papers_split()["dfaust"])
     found = find_subjects(request.folder, known)
@@ -35,10 +35,10 @@ def subjects(request: DataRequest) -> tuple[str, ...]:
 
 
 def load(subject: str, request: DataRequest) -> SubjectData:
-    """Return one subject in the papers' split.
+    """Return one subject in the split of the papers.
 
     Raises:
-        UserError: the subject is unknown, or there are no files of it, or no body model.
+        UserError: the subject is unknown, or has no files or no body model.
     """
     files, splits = require_subject_files(subject, request)
     person = read_amass_subject(files, request)
@@ -47,7 +47,8 @@ def load(subject: str, request: DataRequest) -> SubjectData:
     prior = papers_split()["poseprior"]
     extremes = find_sequences(request.folder, prior["subject"], prior["ood"])
     if extremes:
-        more, missing = amass_sequences(extremes, dict.fromkeys(prior["ood"], "ood"), person, hands, request.folder)
+        splits = same_split(prior["ood"], "ood")
+        more, missing = amass_sequences(extremes, splits, person, hands, request.folder)
         sequences, broken = sequences + more, broken + missing
     else:
         log.warning(
@@ -61,16 +62,16 @@ def load(subject: str, request: DataRequest) -> SubjectData:
 
 
 def require_subject_files(subject: str, request: DataRequest) -> tuple[dict[str, Path], dict[str, Split]]:
-    """Return the files of a subject's sequences, and what each of the papers' sequences is for.
+    """Return the files of a subject's sequences, and the papers' split of each sequence.
 
     Raises:
-        UserError: the subject is unknown, there are no files of it, or data.hands is no choice.
+        UserError: the subject is unknown or has no files, or data.hands is not a valid choice.
     """
     check_choice("data.hands", request.config.hands, HANDS)
     split = papers_split()["dfaust"]
     if subject not in split:
-        raise UserError(f"no DFaust subject '{subject}'{nearest(subject, split)}; there is {', '.join(split)}")
-    splits: dict[str, Split] = dict.fromkeys(split[subject]["train"], "train") | dict.fromkeys(split[subject]["test"], "test")
+        raise UserError(f"no DFaust subject '{subject}'{nearest(subject, split)}; wanted one of {', '.join(split)}")
+    splits = same_split(split[subject]["train"], "train") | same_split(split[subject]["test"], "test")
     files = find_sequences(request.folder, subject, splits)
     if not files:
         raise UserError(_nothing(f"of subject {subject}", subject, request))

@@ -1,8 +1,8 @@
-"""Folds of cloth that come and go with the pose, fixed in place on the body.
+"""Pose-dependent folds of cloth at fixed places of the body.
 
-Bending a joint moves the bone beyond it by m = R d - d, d its direction at first. Where the cloth faces the way that the bone
-goes (n . m > 0) it is pushed together and folds across the bone; on the other side it is drawn tight. Twisting the trunk
-makes slanting folds, to one side or the other. All of it is smooth in the pose and ends within reach of the joint.
+Bending a joint moves the bone beyond it by m = R d - d, where d is its direction in the canonical pose. Where the cloth faces
+in the direction of the motion (n . m > 0), it is compressed and folds across the bone; on the other side it is tight. Twisting
+the trunk causes slanting folds to the left or right. The folds are smooth functions of the pose with limited reach.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 __all__ = ["Folds", "place_folds"]
 
-_BENT = (  # joint, the joint at the other end of its bone, how far its folds reach, metres
+_BENT = (  # joint, the joint at the other end of its bone, reach of its folds, metres
     ("l_hip", "l_knee", 0.26),
     ("r_hip", "r_knee", 0.26),
     ("spine1", "spine3", 0.28),
@@ -30,42 +30,42 @@ _BENT = (  # joint, the joint at the other end of its bone, how far its folds re
 _TWISTED = ("spine1", "spine2", "spine3")
 _TWIST_REACH_M = 0.36
 _WAVE_LENGTH_M = (0.055, 0.08)
-_STEEPNESS = 4.0  # folds are two thirds as deep as they can be when the joint is bent by 12 degrees
+_STEEPNESS = 4.0  # folds have two thirds of their maximum depth when the joint is bent by 12 degrees
 _TWIST_STEEPNESS = 4.0
-_ROUNDING = 0.05  # of the corner between pushed together and drawn tight, in units of n . m
-_TIGHT = 0.6  # of their depth: how far the cloth comes in where it is drawn tight
-_SHARE_OF_STAND_OFF = 0.6  # so that the cloth never comes nearer than the rest of its stand-off
-_DEEPEST_M = 0.018
+_ROUNDING = 0.05  # of the transition between compressed and tight, in units of n . m
+_TIGHT = 0.6  # inward displacement of tight cloth, as a share of the depth of folds
+_SHARE_OF_STAND_OFF = 0.6  # maximum depth as a share of the stand-off, so that cloth never touches the body
+_MAX_DEPTH_M = 0.018
 
 
 @dataclass(frozen=True, eq=False)
 class Folds:
-    """Where the folds of one garment are; D places, each driven by one joint."""
+    """The folds of one garment at D places, each driven by the bending of one joint, and E places driven by twist."""
 
     depth_m: NDArray[np.float64]
-    """[V], how far the cloth may come in or go out; 0 for skin."""
+    """[V], maximum displacement of the cloth inwards or outwards, metres; 0 for skin."""
     bent: NDArray[np.int64]
     """[D], joints whose bending folds the cloth."""
     directions: NDArray[np.float64]
     """[D, 3], directions of their bones in the canonical pose."""
     facing: NDArray[np.float64]
-    """[V, 3], unit vectors: where the cloth faces in the canonical pose."""
+    """[V, 3], unit vectors, directions of the cloth's outer side in the canonical pose."""
     reached: NDArray[np.float64]
-    """[D, V], how much of each place a vertex has, 0 to 1."""
+    """[D, V], influence of each place on a vertex, 0 to 1."""
     waves: NDArray[np.float64]
-    """[D, V], the folds, -1 to 1."""
+    """[D, V], shape of the folds, -1 to 1."""
     twisted: NDArray[np.int64]
     """[E], joints whose twist folds the cloth."""
     twist_reached: NDArray[np.float64]
-    """[E, V], how much of each twist a vertex has, 0 to 1."""
+    """[E, V], influence of each twist on a vertex, 0 to 1."""
     slanting: NDArray[np.float64]
-    """[2, V], folds that slant to the left and to the right, -1 to 1."""
+    """[2, V], shape of folds that slant to the left and to the right, -1 to 1."""
 
     def displacement(self, turned: NDArray) -> NDArray[np.float64]:
-        """Return how far the cloth goes out (positive) or comes in, [B, V], metres, never more than `depth_m`.
+        """Return the outward displacement [B, V] of the cloth, metres, at most `depth_m`.
 
         Args:
-            turned: [B, J, 3, 3], rotations of the joints from the canonical pose, in their parents' axes.
+            turned: [B, J, 3, 3], rotations of the joints from the canonical pose, in the axes of their parents.
         """
         moved = np.einsum("bdij,dj->bdi", turned[:, self.bent], self.directions) - self.directions
         total = np.zeros((len(turned), len(self.depth_m)))
@@ -75,7 +75,7 @@ class Folds:
             pushed, drawn = (rounded + facing) / 2, (rounded - facing) / 2
             total += reached * (np.tanh(_STEEPNESS * pushed) * waves - _TIGHT * np.tanh(_STEEPNESS * drawn))
         rotations = turned[:, self.twisted]
-        twist = (rotations[..., 0, 2] - rotations[..., 2, 0]) / 2  # about y, along the spine; 1 for a quarter turn
+        twist = (rotations[..., 0, 2] - rotations[..., 2, 0]) / 2  # rotation about y, along the spine; 1 for 90 degrees
         rounded = np.sqrt(twist**2 + _ROUNDING**2) - _ROUNDING
         for share, slanting in zip(((rounded + twist) / 2, (rounded - twist) / 2), self.slanting, strict=True):
             total += np.tanh(_TWIST_STEEPNESS * share) @ self.twist_reached * slanting
@@ -83,14 +83,14 @@ class Folds:
 
 
 def place_folds(vertices: NDArray, facing: NDArray, stand_off_m: NDArray, joints: dict[str, NDArray], seed: int) -> Folds:
-    """Lay the folds of a garment.
+    """Return the folds of a garment.
 
     Args:
         vertices: [V, 3], cloth and skin in the canonical pose, metres.
-        facing: [V, 3], their normals.
-        stand_off_m: [V], distance from the body; 0 for skin.
-        joints: its joints by SMPL's names in their order, [3] each, metres.
-        seed: lengths and places of the folds; the same for the same number.
+        facing: [V, 3], normals of the vertices.
+        stand_off_m: [V], distance from the body, metres; 0 for skin.
+        joints: [3] per joint, positions by SMPL's names in their order, metres.
+        seed: determines lengths and places of the folds.
     """
     random = np.random.default_rng([seed, 3])
     names = list(joints)
@@ -100,7 +100,7 @@ def place_folds(vertices: NDArray, facing: NDArray, stand_off_m: NDArray, joints
         along = (joints[end] - start) / np.linalg.norm(joints[end] - start)
         offset = vertices - start
         down = offset @ along
-        # Folds are not rings: they run up and down as they go round the limb, once or twice.
+        # Folds are not rings: around the limb they go up and down once or twice.
         side, front = np.cross(along, [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
         round_rad = np.arctan2(offset @ front, offset @ side)
         shift = random.uniform(0, 2 * np.pi, 3)
@@ -112,12 +112,12 @@ def place_folds(vertices: NDArray, facing: NDArray, stand_off_m: NDArray, joints
     round_m = 0.14 * np.arctan2(vertices[:, 0] - middle[0], vertices[:, 2] - middle[2])
     height = vertices[:, 1] - middle[1]
     shift, length = random.uniform(0, 2 * np.pi, 2), random.uniform(*_WAVE_LENGTH_M)
-    # Seen from outside, turning the chest to the left pulls the cloth into folds that rise towards the left, and so on.
+    # Seen from outside, turning the chest to the left causes folds that rise towards the left, and vice versa.
     slanting = [np.sin(2 * np.pi * (height - sign * round_m) * np.sqrt(0.5) / length + shift[0]) for sign in (1, -1)]
-    # The seam of the angle is in the middle of the back; there they fade.
+    # The angle is discontinuous in the middle of the back; the folds fade out there.
     fading = np.cos(np.clip(round_m / 0.14, -np.pi, np.pi) / 2) ** 2
     return Folds(
-        depth_m=np.minimum(_SHARE_OF_STAND_OFF * stand_off_m, _DEEPEST_M),
+        depth_m=np.minimum(_SHARE_OF_STAND_OFF * stand_off_m, _MAX_DEPTH_M),
         bent=np.array([names.index(name) for name, _, _ in _BENT]),
         directions=np.array(directions),
         facing=facing,
@@ -130,5 +130,10 @@ def place_folds(vertices: NDArray, facing: NDArray, stand_off_m: NDArray, joints
 
 
 def _reached(offset: NDArray, reach: float) -> NDArray[np.float64]:
-    """Return 1 at the joint and a smooth way down to 0 at `reach`, metres; `offset` [V, 3] from the joint."""
+    """Return the influence [V] of a joint: 1 at the joint, smoothly 0 at `reach`, metres.
+
+    Args:
+        offset: [V, 3], offsets from the joint, metres.
+        reach: metres.
+    """
     return np.maximum(1 - (offset * offset).sum(1) / reach**2, 0) ** 2

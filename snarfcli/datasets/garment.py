@@ -1,8 +1,8 @@
-"""A garment made to measure for a body: a shirt and trousers, long or short, as one closed surface with the skin that shows.
+"""A garment fitted to a body: shirt and trousers, long or short, as one closed surface together with the visible skin.
 
-In the canonical pose the cloth fills everything nearer to the body than its stand-off (rounded, as cloth spans hollows), up to
-collar, cuffs and hem. That solid is joined with the body by an exact boolean union, so that nothing hidden is left below. A
-vertex of cloth follows the mean of the body's vertices near it, a vertex of skin its own.
+In the canonical pose the cloth fills the space closer to the body than its stand-off (smoothed, since cloth spans hollows), up
+to collar, cuffs and hem. An exact boolean union joins that solid with the body and removes the hidden skin. A vertex of cloth
+follows the mean of nearby body vertices, a vertex of skin follows itself.
 """
 
 from __future__ import annotations
@@ -12,50 +12,52 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
+from scipy.spatial import KDTree
 
 from snarfcli.sampling import winding_numbers
+from snarfcli.sampling.occupancy import count_boundary_edges
 
 __all__ = ["ClothedMesh", "Outfit", "dress"]
 
-_CELL_M = 0.012  # folds are 5 cm long and more; half of it gives four times the vertices
+_CELL_M = 0.012  # folds are at least 5 cm long; half of it gives four times as many vertices
 _BAND_M = 0.03  # cloth spans hollows narrower than about twice this
 _LEAST_STAND_OFF_M = 0.012
-_SAME_M = 1e-5  # the union moves no vertex further than its files' single precision does
+_SAME_M = 1e-5  # the union moves vertices by at most the rounding of single precision
 _NEIGHBOURS = 400  # of 6,890 body vertices
 _LEAST_SHARE = 1e-5
 
 
 @dataclass(frozen=True)
 class Outfit:
-    """What somebody wears."""
+    """Measures of a shirt and trousers."""
 
     sleeve: float
     """Length of the sleeves, as a share of the arm from shoulder to wrist."""
     leg: float
     """Length of the trousers, as a share of the leg from hip to ankle."""
     shirt_length: float
-    """Where the shirt ends, as a share of the way from the lowest joint of the spine to the hips; more than 1: below."""
+    """Height of the hem, as a share of the distance from the lowest joint of the spine to the hips; above 1: below the hips."""
     stand_off_m: float
-    """How far the cloth is from the body at the chest, metres."""
+    """Distance of the cloth from the body at the chest, metres."""
     flare_m: float
-    """How much further at cuffs and hems, metres."""
+    """Additional distance at cuffs and hems, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class ClothedMesh:
-    """A closed mesh of cloth and skin in the canonical pose, and what each vertex follows."""
+    """A closed mesh of cloth and skin in the canonical pose, and the body vertices that each vertex follows."""
 
     vertices: NDArray[np.float64]
     """[V, 3], metres."""
     faces: NDArray[np.int64]
     """[F, 3], vertex numbers, outward."""
     stand_off_m: NDArray[np.float64]
-    """[V], distance from the body; 0 for skin."""
+    """[V], distance from the body, metres; 0 for skin."""
     shares: csr_matrix
-    """[V, B], how much each vertex follows each of the body's; rows sum to 1."""
+    """[V, B], weights with which each vertex follows the body vertices; rows sum to 1."""
 
     def follow(self, values: NDArray) -> NDArray[np.float64]:
-        """Return what the vertices have [V, C] of what the body's have [B, C]."""
+        """Return the values [V, C] of the vertices from values [B, C] of the body vertices."""
         return self.shares @ np.asarray(values, np.float64)
 
 
@@ -87,12 +89,12 @@ def _cloth(vertices: NDArray, faces: NDArray, joints: dict[str, NDArray], outfit
     wide, lowest = np.abs(vertices[:, 0]).max(), joints["l_ankle"][1]
     low = np.array([-wide, lowest, vertices[:, 2].min()]) - reach
     high = np.array([wide, joints["head"][1], vertices[:, 2].max()]) + reach
-    # A grid that is its own mirror image: nobody's clothes hang to one side.
+    # The grid is symmetric, and so are the clothes.
     axes = [_CELL_M * np.arange(np.floor(a / _CELL_M), np.ceil(b / _CELL_M) + 1) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     flat = points.reshape(-1, 3)
     exact = _distance(vertices, faces, flat)
-    near = exact < 3 * reach  # what is farther is outside whatever is near
+    near = exact < 3 * reach  # points further away are outside
     inside = np.zeros(len(flat), bool)
     inside[near] = winding_numbers(vertices, faces, flat[near]) > 0.5
     exact = np.where(inside, -exact, exact).reshape(points.shape[:3])
@@ -100,13 +102,13 @@ def _cloth(vertices: NDArray, faces: NDArray, joints: dict[str, NDArray], outfit
     shirt = _shirt(points, exact, rounded, joints, outfit)
     field = np.minimum(shirt, _trousers(points, exact, rounded, joints, outfit))
     field = np.pad(field, 1, constant_values=reach)
-    field[np.abs(field) < 1e-6] = 1e-6  # a surface through a node has triangles without area
+    field[np.abs(field) < 1e-6] = 1e-6  # a surface through a node has triangles of zero area
     surface, triangles, _, _ = marching_cubes(field.astype(np.float64), 0.0, gradient_direction="descent")
     return surface.astype(np.float64) * _CELL_M + [axis[0] - _CELL_M for axis in axes], triangles.astype(np.int64)
 
 
 def _shirt(points: NDArray, exact: NDArray, rounded: NDArray, joints: dict[str, NDArray], outfit: Outfit) -> NDArray:
-    """Return a function that is negative in the shirt, metres near its border; `points` [X, Y, Z, 3]."""
+    """Return the values [X, Y, Z] of a function that is negative inside the shirt; near its border a distance, metres."""
     spine, hip, neck = joints["spine1"], joints["l_hip"], joints["neck"]
     shoulder, wrist = joints["l_shoulder"], joints["l_wrist"]
     cuff = shoulder[0] + outfit.sleeve * (wrist[0] - shoulder[0])
@@ -116,13 +118,13 @@ def _shirt(points: NDArray, exact: NDArray, rounded: NDArray, joints: dict[str, 
     below_neck = _ramp(points[..., 1], neck[1] + 0.03, neck[1] - 0.06)
     wide = outfit.flare_m * np.maximum(along_sleeve, below_chest) + (outfit.stand_off_m - _LEAST_STAND_OFF_M) * below_neck
     body = _stand_off(exact, rounded, wide)
-    # The collar lies lower in front; sin and cos of 25 degrees.
+    # The collar is lower in front; sin and cos of 25 degrees.
     collar = 0.906 * (points[..., 1] - neck[1] - 0.015) + 0.423 * (points[..., 2] - neck[2])
     return _cut(body, np.abs(points[..., 0]) - cuff, hem - points[..., 1], collar)
 
 
 def _trousers(points: NDArray, exact: NDArray, rounded: NDArray, joints: dict[str, NDArray], outfit: Outfit) -> NDArray:
-    """Return a function that is negative in the trousers, metres near its border."""
+    """Return the values [X, Y, Z] of a function that is negative inside the trousers; near its border a distance, metres."""
     hip, ankle = joints["l_hip"], joints["l_ankle"]
     length = np.linalg.norm(ankle - hip)
     mirrored = np.concatenate([np.abs(points[..., :1]), points[..., 1:]], axis=-1)
@@ -134,12 +136,12 @@ def _trousers(points: NDArray, exact: NDArray, rounded: NDArray, joints: dict[st
 
 
 def _stand_off(exact: NDArray, rounded: NDArray, wider: NDArray) -> NDArray:
-    """Return the distance to cloth that is `wider` than its least stand-off from a rounded body, and never nearer than that."""
+    """Return the distance to cloth that exceeds the least stand-off from a smoothed body by `wider`, metres."""
     return np.minimum(rounded - wider, exact) - _LEAST_STAND_OFF_M
 
 
 def _cut(field: NDArray, *others: NDArray) -> NDArray:
-    """Return the greatest of functions, rounded off where two meet: a sharp edge between grid nodes would come out as teeth."""
+    """Return the maximum of functions, rounded where two meet, since a sharp edge between grid nodes would become jagged."""
     for other in others:
         share = np.maximum(1 - np.abs(field - other) / (1.5 * _CELL_M), 0)
         field = np.maximum(field, other) + 0.375 * _CELL_M * share * share
@@ -154,18 +156,16 @@ def _ramp(x: NDArray, start: float, end: float) -> NDArray:
 
 def _union(one: tuple[NDArray, NDArray], other: tuple[NDArray, NDArray]) -> tuple[NDArray, NDArray]:
     """Return the outer surface of two closed meshes."""
-    import pymeshlab
+    import pymeshlab  # here, since it takes a second to import
 
-    from snarfcli.sampling.occupancy import count_boundary_edges
-
-    meshes = pymeshlab.MeshSet(verbose=False)
+    meshes = pymeshlab.MeshSet(verbose=False)  # pyright: ignore[reportAttributeAccessIssue]  # its stub lists no classes
     for vertices, faces in (one, other):
-        meshes.add_mesh(pymeshlab.Mesh(vertices, faces))
+        meshes.add_mesh(pymeshlab.Mesh(vertices, faces))  # pyright: ignore[reportAttributeAccessIssue]
     meshes.generate_boolean_union(first_mesh=0, second_mesh=1)
     joined = meshes.current_mesh()
     vertices, faces = joined.vertex_matrix(), joined.face_matrix().astype(np.int64)
     if not len(faces) or count_boundary_edges(faces):
-        raise ValueError(f"body and garment: wanted a closed surface, got {len(faces)} faces, open or none")
+        raise ValueError(f"body and garment: wanted a closed surface, got an open one of {len(faces)} faces")
     return vertices, faces
 
 
@@ -177,19 +177,18 @@ def _distance(vertices: NDArray, faces: NDArray, points: NDArray) -> NDArray[np.
 
 
 def _shares(vertices: NDArray, faces: NDArray, joined: NDArray, stand_off: NDArray) -> csr_matrix:
-    """Return how much each vertex of the joined mesh follows each of the body's, [V, B]."""
+    """Return the weights [V, B] with which each vertex of the joined mesh follows the body vertices."""
     import igl
-    from scipy.spatial import cKDTree
 
-    distance, followed = cKDTree(vertices).query(joined, k=_NEIGHBOURS)
-    # The farther from the body, the more of it counts.
+    distance, followed = map(np.asarray, KDTree(vertices).query(joined, k=_NEIGHBOURS))
+    # The further from the body, the more of its vertices count.
     width = 0.02 + 0.8 * np.maximum(stand_off, 0)[:, None]
     shares = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / width**2)
     shares /= shares.sum(axis=1, keepdims=True)
-    # On the skin: the corners of the triangle that the vertex lies in, which for the body's own vertices is that vertex.
+    # On the skin: the corners of the triangle that contains the vertex; for an original body vertex, that vertex alone.
     skin = np.flatnonzero(stand_off < _SAME_M)
     _, face, closest = igl.point_mesh_squared_distance(joined[skin], vertices, faces)
-    corners = faces[face]
+    corners = faces[np.asarray(face)]
     a, b, c = (np.ascontiguousarray(vertices[corners[:, i]]) for i in range(3))
     followed[skin, :3], shares[skin] = corners, 0
     shares[skin, :3] = _barycentric(np.asarray(closest), a, b, c)
@@ -200,7 +199,7 @@ def _shares(vertices: NDArray, faces: NDArray, joined: NDArray, stand_off: NDArr
 
 
 def _barycentric(points: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray[np.float64]:
-    """Return the shares [N, 3] of the corners in points of their triangles."""
+    """Return the barycentric coordinates [N, 3] of points [N, 3] in their triangles a, b, c [N, 3]."""
     normal = np.cross(b - a, c - a)
     area = np.maximum((normal * normal).sum(1), 1e-30)
     first = (np.cross(c - b, points - b) * normal).sum(1) / area

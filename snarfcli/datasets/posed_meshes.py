@@ -1,7 +1,7 @@
-"""Where the posed meshes of a sequence come from: arrays, a body model, a rig, or files.
+"""Sources of the posed meshes of a sequence: arrays, a body model, a rig, or files.
 
-Worker processes unpickle what `chosen` returns and so import this file; without PyTorch, which takes longer to import than
-ten frames take to sample, they start in 0.4 s.
+Worker processes unpickle the result of `chosen` and import this file for it. It does not import PyTorch, whose import takes
+longer than sampling ten frames, so that they start in 0.4 s.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Mesh = tuple[NDArray, NDArray]
 
 
 class PosedMeshes(Protocol):
-    """The posed meshes of one sequence, frame by frame: vertices [V, 3], metres, and outward faces [F, 3].
+    """The posed meshes of one sequence by frame: vertices [V, 3], metres, and outward faces [F, 3].
 
-    `chosen` is called where the data set was loaded and hands some frames on to a worker process, which asks for the meshes:
-    what it returns must be picklable, and small or quickly made.
+    The main process calls `chosen` and sends the result to a worker process, which reads the meshes. The result must be
+    picklable, and small or fast to compute.
     """
 
     def __len__(self) -> int: ...
@@ -41,17 +41,17 @@ class PosedMeshes(Protocol):
         ...
 
     def source(self, index: int) -> str:
-        """Return the name of the file that a mesh is read from; empty if it is made otherwise."""
+        """Return the name of the file that a mesh is read from; empty if there is none."""
         ...
 
     def fingerprint(self) -> str:
-        """Return a word that changes when the files do that the meshes are read from; empty if there are none."""
+        """Return a digest of the files that the meshes are read from; empty if there are none."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class ArrayMeshes:
-    """Meshes of one topology that are in memory."""
+    """Meshes of one topology in memory."""
 
     vertices: NDArray
     """[T, V, 3], metres."""
@@ -94,11 +94,11 @@ class BodyMeshes:
         return self.chosen(np.array([index]))[0]
 
     def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
-        import torch
+        import torch  # here, since worker processes start without it
 
         body = self.body.to(torch.float64)
         pose, translation = torch.from_numpy(self.poses[frames]), torch.from_numpy(self.translation[frames])
-        posed = [  # one at a time: the pose correctives of many are large
+        posed = [  # one at a time, since the pose correctives of all frames are large
             body.pose(pose[i : i + 1], self.betas, translation[i : i + 1]).vertices[0] for i in range(len(frames))
         ]
         return ArrayMeshes(torch.stack(posed).numpy().astype(np.float32), body.faces.numpy().astype(np.int32))
@@ -112,10 +112,10 @@ class BodyMeshes:
 
 @dataclass(frozen=True, eq=False)
 class RigMeshes:
-    """A mesh moved by the joints of a rig: linear blend skinning, done when frames are chosen."""
+    """A rigged mesh, posed by linear blend skinning when frames are chosen."""
 
     vertices: NDArray
-    """[V, 3], in the rest pose, metres."""
+    """[V, 3], vertices in the rest pose, metres."""
     faces: NDArray
     """[F, 3], vertex numbers, outward."""
     weights: NDArray
@@ -144,14 +144,14 @@ class RigMeshes:
 
 @dataclass(frozen=True, eq=False)
 class FileMeshes:
-    """One mesh file a frame, read where the meshes are asked for."""
+    """One mesh file per frame, read when a mesh is requested."""
 
     paths: Sequence[Path]
     """T files."""
     read: Callable[[Path], Mesh]
-    """A module-level function that reads one."""
+    """A module-level function that reads one file."""
     world_from_file: NDArray
-    """[4, 4], what turns and scales a file's vertices into the data set's world, metres."""
+    """[4, 4], rotation and scale from the vertices of a file to metres and y up."""
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -167,7 +167,7 @@ class FileMeshes:
         return str(self.paths[index])
 
     def fingerprint(self) -> str:
-        # Names and contents, not times: a copy of a data set is the same. Sizes do not tell: a binary mesh keeps its size when
-        # it is mended.
+        # Names and contents, not times, so that a copy of a data set counts as equal. Sizes are not enough: a binary mesh keeps
+        # its size when vertices change.
         contents = "\n".join(f"{path.name} {file_digest(path)}" for path in self.paths)
         return hashlib.sha256(contents.encode()).hexdigest()[:16]

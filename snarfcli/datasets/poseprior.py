@@ -1,10 +1,11 @@
-"""PosePrior (MPI_Limits in AMASS) by itself: the out-of-distribution poses, on the body of a DFaust subject."""
+"""PosePrior (MPI_Limits in AMASS) alone: the out-of-distribution poses, on the body of a DFaust subject."""
 
 from __future__ import annotations
 
 from snarfcli.datasets import dfaust
 from snarfcli.datasets.amass import amass_sequences, find_sequences, papers_split, read_amass_subject
 from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.splits import same_split
 from snarfcli.datasets.subjects import SubjectData, body_template
 from snarfcli.errors import UserError
 
@@ -14,10 +15,10 @@ subjects = dfaust.subjects
 
 
 def load(subject: str, request: DataRequest) -> SubjectData:
-    """Return PosePrior's sequences on the body of one DFaust subject, all of them out of distribution.
+    """Return PosePrior's sequences on the body of one DFaust subject, all out of distribution.
 
     Raises:
-        UserError: there are no files of PosePrior, or none of the subject, whose shape is needed, or no body model.
+        UserError: files of PosePrior, files of the subject (which give the shape), or the body model are missing.
     """
     prior = papers_split()["poseprior"]
     extremes = find_sequences(request.folder, prior["subject"], prior["ood"])
@@ -27,7 +28,7 @@ def load(subject: str, request: DataRequest) -> SubjectData:
             "op2_poses.npz; see data/README.md, or give data.folder=FOLDER"
         )
     person = read_amass_subject(dfaust.require_subject_files(subject, request)[0], request)
-    splits = dict.fromkeys(prior["ood"], "ood")
+    splits = same_split(prior["ood"], "ood")
     sequences, broken = amass_sequences(extremes, splits, person, request.config.hands, request.folder)
     template = body_template(person.body, person.betas, person.skeleton)
     sources = (*person.sources, f"poses {next(iter(extremes.values())).parent}")

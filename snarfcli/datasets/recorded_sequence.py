@@ -1,4 +1,4 @@
-"""One recorded sequence of a skeleton, in the units and axes of its files, and how it becomes one of the data set."""
+"""A recorded sequence in the units and axes of its files, and its conversion to metres and y up."""
 
 from __future__ import annotations
 
@@ -16,47 +16,47 @@ from snarfcli.datasets.splits import Split
 from snarfcli.datasets.subjects import SequenceSpec
 from snarfcli.motions import Motion
 
-__all__ = ["PERSON_M", "Recording", "World", "person_scale"]
+__all__ = ["PERSON_M", "FileToWorld", "RecordedSequence", "person_scale"]
 
 PERSON_M = 1.8
-"""Longest side that a subject is scaled to: the settings of training hold lengths that fit a person."""
+"""Longest side after scaling, metres: the lengths in the settings of training fit a person."""
 
 _NEAR_A_PERSON_M = (1.2, 2.4)
-_APART_M = 1e-3  # poses that reproduce the bone transforms to a millimetre are as good as the transforms
-_TEST_SHARE = 0.2  # of the frames of an only sequence
+_TOLERANCE_M = 1e-3  # poses that reproduce the bone transforms within a millimetre replace them
+_TEST_SHARE = 0.2  # of the frames of a single sequence
 
 
 @dataclass(frozen=True)
-class World:
-    """From the units and axes of the files to metres and y up."""
+class FileToWorld:
+    """Conversion from the units and axes of the files to metres and y up."""
 
     scale: float
-    """Metres a unit."""
+    """Metres per unit."""
     up: str
-    """Which way is up in the files: y or z."""
+    """Up axis of the files: y or z."""
 
     @property
     def turn(self) -> NDArray[np.float64]:
-        """[3, 3], rotation; z up becomes y up, and what faced -y faces +z."""
+        """[3, 3], rotation from the axes of the files; z up becomes y up, and facing -y becomes facing +z."""
         return np.eye(3) if self.up == "y" else np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """[4, 4], from the files to the world: turned and scaled."""
+        """[4, 4], rotation and scale from the files to metres and y up."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.turn
         return matrix
 
     def points(self, points: NDArray) -> NDArray[np.float64]:
-        """Return points or offsets [..., 3] of the files, metres."""
+        """Convert points or offsets [..., 3] of the files to metres."""
         return self.scale * (np.asarray(points, np.float64) @ self.turn.T)
 
     def angles(self, axis_angle: NDArray) -> NDArray[np.float64]:
-        """Return axis-angle vectors [..., 3] of the files in the turned axes."""
+        """Rotate axis-angle vectors [..., 3] of the files to y up."""
         return np.asarray(axis_angle, np.float64) @ self.turn.T
 
     def transforms(self, transforms: NDArray) -> NDArray[np.float64]:
-        """Return bone transforms [..., 4, 4] of the files, metres."""
+        """Convert bone transforms [..., 4, 4] of the files to metres."""
         moved = np.array(transforms, np.float64)
         moved[..., :3, :3] = self.turn @ moved[..., :3, :3] @ self.turn.T
         moved[..., :3, 3] = self.points(moved[..., :3, 3])
@@ -64,18 +64,18 @@ class World:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class RecordedSequence:
     """A sequence in the units and axes of its files."""
 
     name: str
-    """Its name, which may be a folder's."""
+    """Name of the sequence, which can be a folder name."""
     poses: PoseFile
-    """How the skeleton moves."""
+    """Motion of the skeleton."""
     meshes: FileMeshes | RigMeshes
-    """The mesh of every frame: files that are turned and scaled later on, or a rig that is in the world already."""
+    """The mesh of every frame: files, which are converted when they are read, or a rig that is already converted."""
 
-    def to_sequence(self, split: Split, skeleton: Skeleton, world: World) -> SequenceSpec:
-        """Return the sequence in the world: poses where they reproduce the transforms, else the transforms too."""
+    def to_sequence(self, split: Split, skeleton: Skeleton, world: FileToWorld) -> SequenceSpec:
+        """Return the converted sequence; bone transforms are kept only if the poses do not reproduce them."""
         poses, posed_from_rest = self.poses, None
         if poses.posed_from_rest is not None:
             transforms = world.transforms(poses.posed_from_rest)
@@ -83,38 +83,40 @@ class Recording:
                 array.numpy()
                 for array in pose_from_transforms(torch.from_numpy(transforms), skeleton.parents, skeleton.joints_rest)
             )
-            posed_from_rest = transforms if apart.max() > _APART_M else None
-        else:
+            posed_from_rest = transforms if apart.max() > _TOLERANCE_M else None
+        elif poses.poses is not None and poses.translation is not None:
             angles, translation = world.angles(poses.poses), world.points(poses.translation)
+        else:
+            raise ValueError(f"{self.name}: wanted bone transforms, or poses with a translation, got neither")
         motion = Motion(self.name, angles, translation, poses.frame_rate)
         meshes = self.meshes
         if isinstance(meshes, FileMeshes):
             meshes = replace(meshes, world_from_file=world.matrix)
         return SequenceSpec(self.name, split, motion, meshes, posed_from_rest)
 
-    def halves(self) -> list[Recording]:
-        """Return the sequence without its last fifth, and the last fifth as a sequence of its own; one frame stays whole."""
+    def split_off_test(self) -> list[RecordedSequence]:
+        """Return the sequence without its last fifth, and the last fifth; a single frame is not split."""
         count = self.poses.num_frames
         if count < 2:
             return [self]
         cut = count - max(1, round(_TEST_SHARE * count))
         return [self._part(self.name, slice(0, cut)), self._part(f"{self.name}_end", slice(cut, count))]
 
-    def _part(self, name: str, frames: slice) -> Recording:
+    def _part(self, name: str, frames: slice) -> RecordedSequence:
         arrays = {key: getattr(self.poses, key) for key in ("poses", "translation", "posed_from_rest")}
         poses = replace(self.poses, **{key: array[frames] for key, array in arrays.items() if array is not None})
         if isinstance(self.meshes, FileMeshes):
-            return Recording(name, poses, replace(self.meshes, paths=self.meshes.paths[frames]))
-        return Recording(name, poses, replace(self.meshes, posed_from_rest=self.meshes.posed_from_rest[frames]))
+            return RecordedSequence(name, poses, replace(self.meshes, paths=self.meshes.paths[frames]))
+        return RecordedSequence(name, poses, replace(self.meshes, posed_from_rest=self.meshes.posed_from_rest[frames]))
 
 
 def person_scale(vertices: NDArray, wanted: str, given: float | None) -> tuple[float, str]:
-    """Return metres a unit, and why.
+    """Return the metres per unit, and the reason as text.
 
     Args:
-        vertices: [V, 3], of a mesh, units of its file.
-        wanted: what the user asks for: auto, or a positive number.
-        given: what the skeleton's file says, if it does.
+        vertices: [V, 3], vertices of a mesh, units of its file.
+        wanted: the setting data.scale: auto, or a positive number.
+        given: scale of the skeleton file; None if it has none.
     """
     length = float(np.ptp(vertices, axis=0).max())
     if wanted != "auto":
@@ -124,4 +126,4 @@ def person_scale(vertices: NDArray, wanted: str, given: float | None) -> tuple[f
     if _NEAR_A_PERSON_M[0] <= length <= _NEAR_A_PERSON_M[1] or not length > 0:
         return 1.0, f"not scaled: {length:.2f} m long"
     scale = PERSON_M / length
-    return scale, f"scaled by {scale:.4g}, so that {length:.4g} units become {PERSON_M} m; data.scale=NUMBER sets it"
+    return scale, f"scaled by {scale:.4g}, so {length:.4g} units become {PERSON_M} m; data.scale=NUMBER sets it"

@@ -1,4 +1,4 @@
-"""Rigged files as subjects: the skeleton, the skin and the motions of one or more glTF or BVH files."""
+"""Read rigged files as subjects: skeleton, skin and motions of one or more glTF or BVH files."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ from snarfcli.formats.rig import Rig, RigMesh
 __all__ = ["RIG_SUFFIXES", "RiggedFiles", "bvh_poses", "bvh_skeleton", "read_rigged_files"]
 
 RIG_SUFFIXES = (".glb", ".gltf")
-"""Of files that hold a skeleton, a skin and animations."""
+"""Suffixes of files that can have a skeleton, a skin and animations."""
 
-_SAME_PLACE = 0.01  # of the skeleton's size: rest joints further apart than this are of another skeleton
+_SAME_PLACE = 0.01  # share of the skeleton's size; if rest joints differ by more, the skeletons differ
 
 
 @dataclass(frozen=True, eq=False)
 class RiggedFiles:
-    """What rigged files of one skeleton hold together, in their units and axes."""
+    """The common content of rigged files of one skeleton, in their units and axes."""
 
     skeleton: SkeletonFile
-    """The joints that move the mesh, and those between them."""
+    """The joints that move the mesh, and the joints between them."""
     mesh: RigMesh
-    """The mesh at rest, weights of these joints."""
+    """The mesh at rest, with weights of these joints."""
     clips: tuple[tuple[str, PoseFile], ...]
-    """The motions by name, as bone transforms."""
+    """Name and bone transforms of each motion."""
     dropped: tuple[str, ...]
-    """Last joints that move no vertex, which were left out."""
+    """Names of the end joints without vertices, which were left out."""
 
 
 def read_rigged_files(paths: Sequence[Path]) -> RiggedFiles:
     """Read glTF files of one skeleton: the mesh of the first that has one, the animations of all.
 
-    Last joints that move no vertex (the ends of fingers, tools, helpers) are left out, again and again until each last joint
-    moves something: a joint costs weights everywhere, and these have none.
+    End joints that move no vertex (ends of fingers, tools, helpers) are left out repeatedly until every end joint moves a
+    vertex, since each joint needs a weight at every point.
 
     Raises:
-        UserError: a file cannot be read, has another skeleton than the one with the mesh, or none has a mesh.
+        UserError: a file cannot be read or has another skeleton than the file with the mesh, or no file has a mesh.
     """
     rigs = {path: read_gltf(path) for path in paths}
-    path = next((path for path, rig in rigs.items() if rig.mesh is not None), None)
-    if path is None:
+    skinned = next(((path, rig, rig.mesh) for path, rig in rigs.items() if rig.mesh is not None), None)
+    if skinned is None:
         raise UserError(f"{paths[0]} has no mesh that its joints move; export it with its skin, or give meshes as files")
-    first = rigs[path]
-    kept = _moving_joints(first, first.mesh.weights)
+    path, first, whole = skinned
+    kept = _moving_joints(first, whole.weights)
     clips = []
     for other, rig in rigs.items():
         if not rig.clips:
@@ -59,18 +59,18 @@ def read_rigged_files(paths: Sequence[Path]) -> RiggedFiles:
         columns = _same_joints(path, first, other, rig, kept)
         for clip in rig.clips:
             name = clip.name
-            if len(paths) > 1:  # animation tools give the only clip of every file the same name
+            if len(paths) > 1:  # animation tools give the clip of every file the same name
                 name = other.stem if len(rig.clips) == 1 else f"{other.stem}_{clip.name}"
-            # The mesh is bound where the first file says; where the others stand at rest does not matter.
+            # The bind pose is that of the file with the mesh; the rest poses of the others do not matter.
             moved = clip.world_from_joint[:, columns] @ np.linalg.inv(first.rest[kept])
             clips.append((name, PoseFile(clip.frame_rate, posed_from_rest=moved)))
     dropped = tuple(name for joint, name in enumerate(first.names) if joint not in set(kept.tolist()))
-    mesh = RigMesh(first.mesh.vertices, first.mesh.faces, first.mesh.weights[:, kept])
+    mesh = RigMesh(whole.vertices, whole.faces, whole.weights[:, kept])
     return RiggedFiles(_skeleton(first, kept), mesh, tuple(clips), dropped)
 
 
 def bvh_skeleton(path: Path) -> SkeletonFile:
-    """Return the skeleton of a BVH file, without the ends of the last bones, which never turn.
+    """Return the skeleton of a BVH file without End Sites, which never rotate.
 
     Raises:
         UserError: the file cannot be read.
@@ -80,10 +80,10 @@ def bvh_skeleton(path: Path) -> SkeletonFile:
 
 
 def bvh_poses(path: Path, skeleton: SkeletonFile) -> PoseFile:
-    """Return the motion of a BVH file as bone transforms of a skeleton whose joints it names.
+    """Return the motion of a BVH file as bone transforms of a skeleton, matched by joint names.
 
     Raises:
-        UserError: the file cannot be read, has no frames, lacks a joint, or has it elsewhere at rest.
+        UserError: the file cannot be read, has no frames, lacks a joint, or has a joint elsewhere at rest.
     """
     rig = read_bvh(path)
     missing = [name for name in skeleton.names if name not in rig.names]
@@ -92,12 +92,12 @@ def bvh_poses(path: Path, skeleton: SkeletonFile) -> PoseFile:
     columns = np.array([rig.names.index(name) for name in skeleton.names])
     rest = rig.rest[columns, :3, 3]
     size = max(float(np.ptp(skeleton.joints_rest, axis=0).max()), 1e-9)
-    # Where the whole skeleton stands at rest is nobody's business: the motion says where it goes.
+    # The position of the whole skeleton at rest does not matter; the motion defines it.
     apart = np.abs((rest - rest[0]) - (skeleton.joints_rest - skeleton.joints_rest[0])).max(1)
     if apart.max() > _SAME_PLACE * size:
         raise UserError(
-            f"BVH file {path} has joint {skeleton.names[apart.argmax()]!r:.60} elsewhere at rest than the skeleton "
-            f"({apart.max():.3g} units apart); give one of the same skeleton"
+            f"BVH file {path}: joint {skeleton.names[apart.argmax()]!r:.60} at rest: wanted the position of the skeleton, "
+            f"got one {apart.max():.3g} units away; give a file of the same skeleton"
         )
     if not rig.clips:
         raise UserError(f"BVH file {path} has no frames; export it with its motion")
@@ -118,10 +118,10 @@ def _skeleton(rig: Rig, kept: NDArray[np.int64]) -> SkeletonFile:
 
 
 def _moving_joints(rig: Rig, weights: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the joints that move a vertex, or have one below them that does; the first always stays."""
-    needed = (weights > 0).any(0)
+    """Return the joints that move a vertex or have a descendant that does, and joint 0."""
+    needed: NDArray[np.bool_] = np.any(weights > 0, axis=0)
     needed[0] = True
-    for joint in range(len(needed) - 1, 0, -1):  # the children come after their parent
+    for joint in range(len(needed) - 1, 0, -1):  # children come after their parents
         if needed[joint] and rig.parents[joint] >= 0:
             needed[rig.parents[joint]] = True
     return np.flatnonzero(needed)
@@ -137,7 +137,7 @@ def _without_ends(rig: Rig) -> NDArray[np.int64]:
 
 
 def _same_joints(path: Path, first: Rig, other: Path, rig: Rig, kept: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return where another file has the joints of the first, which must be as far apart there."""
+    """Return the indices of the first file's joints in another file; distances to the parents must agree."""
     missing = [first.names[joint] for joint in kept if first.names[joint] not in rig.names]
     if missing:
         raise UserError(f"{other} has no joint {missing[0]!r:.60}, which {path.name} has; give each skeleton its own folder")
@@ -149,11 +149,13 @@ def _same_joints(path: Path, first: Rig, other: Path, rig: Rig, kept: NDArray[np
     apart = np.abs(lengths[0] - lengths[1])
     if apart.max() > _SAME_PLACE * max(float(np.ptp(first.rest[kept, :3, 3], axis=0).max()), 1e-9):
         joint = first.names[kept[apart.argmax()]]
-        raise UserError(f"{other} has {joint!r:.60} at another distance of its parent than {path.name}; export all alike")
+        raise UserError(
+            f"{other}: {joint!r:.60}: wanted the distance to its parent of {path.name}, got another; export all alike"
+        )
     return columns
 
 
 def _parents(rig: Rig, kept: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the place of each kept joint's parent among the kept ones, its own for a root."""
+    """Return the index of each kept joint's parent among the kept joints; the joint itself for a root."""
     place = {int(joint): number for number, joint in enumerate(kept)}
     return np.array([place[rig.parents[joint]] if rig.parents[joint] >= 0 else place[int(joint)] for joint in kept])

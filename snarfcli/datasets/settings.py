@@ -1,4 +1,4 @@
-"""What can be chosen about a data set."""
+"""Settings of a data set."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ __all__ = ["DataConfig"]
 
 @dataclass
 class DataConfig:
-    """Which data, and how densely it is taken."""
+    """Name of the data set, folders, and sampling of frames."""
 
     name: str = MISSING
     """Name of the data set: builtin, clothed, dfaust, poseprior, cape, meshes or stick2d."""
     frame_step: int = MISSING
-    """Every how many frames of a training sequence one is taken."""
+    """Use every n-th frame of a training sequence."""
     test_frame_step: int = MISSING
-    """The same for the held-out sequences."""
+    """Use every n-th frame of a held-out sequence."""
     ood_frame_step: int = MISSING
-    """The same for the out-of-distribution sequences."""
+    """Use every n-th frame of an out-of-distribution sequence."""
     folder: str | None = None
-    """Folder with the files; null: they are looked for below data_root."""
+    """Folder with the files; null searches below data_root."""
     avatars: str | None = None
-    """Data set whose avatars are evaluated on this one; null: its own."""
+    """Data set whose avatars are evaluated on this one; null for this data set."""
     test: list[str] = field(default_factory=list)
-    """Names or patterns (such as walk*) of held-out sequences; empty: the data set's own split (cape, meshes)."""
+    """Names or patterns (such as walk*) of held-out sequences; empty for the split of the data set (cape, meshes)."""
     ood: list[str] = field(default_factory=list)
-    """Names or patterns of out-of-distribution sequences; empty: the data set's own (cape, meshes)."""
+    """Names or patterns of out-of-distribution sequences; empty for those of the data set (cape, meshes)."""
     hands: str = "rest"
-    """SMPL's two hand joints from SMPL-H poses: rest (straight), or released (columns 66 to 72, as in the papers' code)."""
+    """SMPL's two hand joints from SMPL-H poses: rest (zero), or released (columns 66 to 72, as in the papers' code)."""
     scale: str = "auto"
-    """Metres a unit of the files, for meshes; auto: 1 for a subject as large as a person, else so that it becomes as large."""
+    """Metres per unit of the files, for meshes; auto is 1 for a subject of a person's size, else scales it to that size."""
     up: str = "auto"
-    """Which way is up in the files of meshes: auto, y or z."""
+    """Up axis of the files, for meshes: auto, y or z."""
     canonical: str = "auto"
-    """Canonical pose, for meshes: rest, legs_apart (T-pose at rest: SNARF's), or auto: the skeleton file's, else rest."""
+    """Canonical pose, for meshes: rest, legs_apart (SNARF's, for a T-pose at rest), or auto: the skeleton file's, else rest."""

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from typing import Literal
 
 from snarfcli.errors import UserError, nearest
 
-__all__ = ["SPLITS", "Split", "split_sequences"]
+__all__ = ["SPLITS", "Split", "same_split", "split_sequences"]
 
 Split = Literal["train", "test", "ood"]
 SPLITS: tuple[Split, ...] = ("train", "test", "ood")
 """Training motion, held-out motion of the same kind, out-of-distribution motion; in this order everywhere."""
 
 _TEST_SHARE = 0.2
+
+
+def same_split(names: Iterable[str], split: Split) -> dict[str, Split]:
+    """Return the same split for each name."""
+    return dict.fromkeys(names, split)
 
 
 def split_sequences(names: Sequence[str], test: Sequence[str], ood: Sequence[str]) -> dict[str, Split]:

@@ -1,6 +1,7 @@
 """The two-dimensional stick of SNARF Sec. 4.1 and 4.3: two bones in the plane z = 0, with or without a rigid object.
 
-The papers give the weights (inverse distances to the bones) and the angles; sizes, the object and the number of poses are ours.
+The papers give the weights (inverse distances to the bones) and the angles, but not the sizes, the object and the number of
+poses.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from snarfcli.motions import Motion
 __all__ = ["STICK_STEPS_DEG", "STICK_SUBJECTS", "load", "stick_subject", "stick_weights", "subjects"]
 
 STICK_STEPS_DEG = {"stick_step10": 10, "stick_step20": 20, "stick_step30": 30, "stick_step60": 60}
-"""Subjects for interpolation, and the step of the lattice of their training angles."""
+"""Subjects for interpolation, and the step of the lattice of their training angles, degrees."""
 
 STICK_SUBJECTS = ("stick", "stick_object", *STICK_STEPS_DEG)
 """`stick`, `stick_object` (with a rigid object that the stick reaches) and the subjects for interpolation."""
 
-_HALF_WIDTH_M, _HALF_LENGTH_M = 0.15, 0.8  # lengths of a person, which the settings of training are made for
-_REACH_M = 0.7  # from the middle joint to either end of the bones, which lie inside the stick
+_HALF_WIDTH_M, _HALF_LENGTH_M = 0.15, 0.8  # the size of a person, for which the settings of training are made
+_REACH_M = 0.7  # from the middle joint to each end of the bones, which are inside the stick
 _CELLS = (24, 128)  # quadrilaterals across and along: sides of 12.5 mm, an even number across for a column on the bones
 _HALF_HEIGHT_M = 0.02  # of the prism; thin, so that the nodes of the weight grid lie in the plane
 _OBJECT_AT_M, _OBJECT_RADIUS_M, _OBJECT_SIDES, _OBJECT_RINGS = (0.5, -0.4), 0.2, 96, 8
-_NEAREST_M = 1e-9  # a point on a bone is that bone's
+_NEAREST_M = 1e-9  # a point on a bone gets weight 1 of that bone
 
 _TRAINED_DEG, _FARTHEST_DEG = 60.0, 120.0  # SNARF Sec. 4.3
 _TRAIN_FRAMES, _TEST_FRAMES = 120, 60
-_FRAME_RATE = 30.0  # of frames that are in no order of time
+_FRAME_RATE = 30.0  # arbitrary, since the frames have no order in time
 _LOWER, _UPPER = 1, 2
 
 
@@ -46,10 +47,10 @@ def subjects(request: DataRequest) -> tuple[str, ...]:
 
 
 def load(subject: str, request: DataRequest) -> SubjectData:
-    """Make one of the sticks.
+    """Return one of the sticks.
 
     Raises:
-        UserError: there is no such stick, or a body was asked for.
+        UserError: there is no such stick, or a body is given.
     """
     if request.body is not None:
         raise UserError("data=stick2d has no body model; leave out body=")
@@ -57,34 +58,40 @@ def load(subject: str, request: DataRequest) -> SubjectData:
 
 
 def stick_subject(subject: str) -> SubjectData:
-    """Make one of `STICK_SUBJECTS`: always the same one for the same name.
+    """Return one of `STICK_SUBJECTS`; the result depends only on the name.
 
-    Joints: `root` at the lower end, which never turns; `lower` at the same place and `upper` in the middle, which turn the two
-    bones about z; `tip`, where the upper bone ends; and `object`, a root of its own that stays where it is.
+    Joints: `root` at the lower end, which never rotates; `lower` at the same place and `upper` in the middle, which rotate the
+    two bones about z; `tip` at the end of the upper bone; and `object`, a second root that does not move.
 
     Raises:
         UserError: there is no such stick.
     """
     if subject not in STICK_SUBJECTS:
-        raise UserError(f"no stick '{subject}'{nearest(subject, STICK_SUBJECTS)}; there is {', '.join(STICK_SUBJECTS)}")
+        raise UserError(f"no stick '{subject}'{nearest(subject, STICK_SUBJECTS)}; wanted one of {', '.join(STICK_SUBJECTS)}")
     has_object = subject == "stick_object"
     skeleton = _skeleton(has_object)
     outlines = [_strip(), *([_disk()] if has_object else [])]
     template = _prisms(outlines, skeleton.num_joints)
     generator = np.random.default_rng(6021)  # the poses of `stick` are those of `stick_object`
-    angles = {
+    angles: dict[Split, NDArray[np.float64]] = {
         "train": _training_angles(STICK_STEPS_DEG.get(subject), generator),
         "test": _inside(_TEST_FRAMES, generator),
         "ood": _outside(_TEST_FRAMES, generator),
     }
     names: dict[Split, str] = {"train": "bend", "test": "bend_anew", "ood": "bend_further"}
     sequences = tuple(_sequence(names[split], split, values, skeleton, template) for split, values in angles.items())
-    sources = ("the stick of SNARF Sec. 4.1, made by the program",)
+    sources = ("the stick of SNARF Sec. 4.1, generated",)
     return SubjectData("stick2d", subject, skeleton, sequences, template, sources=sources, is_planar=True)
 
 
 def stick_weights(points: NDArray) -> NDArray[np.float64]:
-    """Return the weights [..., 2] of the lower and the upper bone at points of the stick [..., 2], canonical frame, metres.
+    """Return the skinning weights of the stick.
+
+    Args:
+        points: [..., 2], canonical frame, metres.
+
+    Returns:
+        [..., 2], weights of the lower and the upper bone.
 
     Source: SNARF Sec. 4.1, "the inverse of its distance to each bone", normalised.
     """
@@ -110,13 +117,13 @@ def _skeleton(has_object: bool) -> Skeleton:
     return Skeleton(tuple(names), tuple(parents), rest, torch.zeros_like(rest))
 
 
-# A flat shape: points [V, 2], triangles [F, 3] counterclockwise, the numbers of the points along its outline counterclockwise,
-# and the weights [V, K] of joints whose numbers are the last item.
+# A flat shape: points [V, 2], counterclockwise triangles [F, 3], indices of the points along its outline counterclockwise,
+# weights [V, K], and the indices of the K joints.
 _Flat = tuple[NDArray, NDArray, NDArray, NDArray, list[int]]
 
 
 def _strip() -> _Flat:
-    """Return the stick, a strip of quadrilaterals cut in two."""
+    """Return the stick: a strip of quadrilaterals, each cut into two triangles."""
     across, along = _CELLS
     x, y = np.linspace(-_HALF_WIDTH_M, _HALF_WIDTH_M, across + 1), np.linspace(-_HALF_LENGTH_M, _HALF_LENGTH_M, along + 1)
     points = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
@@ -128,7 +135,7 @@ def _strip() -> _Flat:
 
 
 def _disk() -> _Flat:
-    """Return the object, a disk of rings around its centre."""
+    """Return the object: a disk of rings around its centre."""
     turn = 2 * np.pi * np.arange(_OBJECT_SIDES) / _OBJECT_SIDES
     circle = np.stack([np.cos(turn), np.sin(turn)], -1)
     radii = _OBJECT_RADIUS_M * np.arange(1, _OBJECT_RINGS + 1) / _OBJECT_RINGS
@@ -142,7 +149,7 @@ def _disk() -> _Flat:
 
 
 def _prisms(shapes: list[_Flat], num_joints: int) -> MeshTemplate:
-    """Return flat shapes as closed prisms around z = 0; walls are two rows high, so that the outline itself has vertices."""
+    """Return flat shapes as closed prisms around z = 0; walls have two rows, so that there are vertices at z = 0."""
     vertices, faces, weights, count = [], [], [], 0
     for points, triangles, outline, own_weights, joints in shapes:
         flat = len(points)
@@ -162,17 +169,17 @@ def _prisms(shapes: list[_Flat], num_joints: int) -> MeshTemplate:
 
 
 def _inside(count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Return angles [count, 2] of the two joints as in training, degrees."""
+    """Return random angles [count, 2] of the two joints in the range of training, degrees."""
     return generator.uniform(-_TRAINED_DEG, _TRAINED_DEG, (count, 2))
 
 
 def _outside(count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Return angles [count, 2], each of them larger than in training, degrees."""
+    """Return random angles [count, 2] of the two joints, all beyond the range of training, degrees."""
     return generator.uniform(_TRAINED_DEG, _FARTHEST_DEG, (count, 2)) * generator.choice([-1.0, 1.0], (count, 2))
 
 
 def _training_angles(step_deg: int | None, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Return angles [T, 2], degrees: random ones or a lattice, and behind them a ninth more for validation."""
+    """Return the training angles [T, 2], degrees: random or a lattice, followed by a ninth as many for validation."""
     if step_deg is None:
         trained = _inside(_TRAIN_FRAMES, generator)
     else:

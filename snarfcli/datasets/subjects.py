@@ -1,4 +1,4 @@
-"""What a data set says about a subject: skeleton, sequences, and where the posed meshes come from."""
+"""The data of a subject: skeleton, sequences and posed meshes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["SequenceSpec", "SubjectData", "body_sequence", "body_template"]
 
 @dataclass(frozen=True, eq=False)
 class SequenceSpec:
-    """One sequence of a subject and what it is for."""
+    """One sequence of a subject and its split."""
 
     name: str
-    """Name of the sequence, which is also a folder's."""
+    """Name of the sequence, also used as a folder name."""
     split: Split
     """`train` (its last part is for validation), `test` (held out), or `ood` (out of distribution)."""
     motion: Motion
@@ -29,9 +29,9 @@ class SequenceSpec:
     meshes: PosedMeshes
     """The posed mesh of every frame of the motion."""
     posed_from_rest: NDArray[np.float64] | None = None
-    """[T, J, 4, 4], bone transforms, metres, where the poses alone do not give them (joints that move or stretch)."""
+    """[T, J, 4, 4], bone transforms, metres, if the poses do not reproduce them (joints that move or stretch)."""
     frames: NDArray[np.int64] | None = None
-    """Numbers of the frames to use, where the data set has chosen them; else every so many as the settings say."""
+    """[K], indices of the frames to use if the data set chooses them; None for the frame step of the settings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,19 +41,19 @@ class SubjectData:
     data: str
     """Name of the data set."""
     subject: str
-    """The subject's id."""
+    """Id of the subject."""
     skeleton: Skeleton
     """Joints of this subject and the canonical pose."""
     sequences: tuple[SequenceSpec, ...]
     """Training, test and out-of-distribution sequences, in this order."""
     template: MeshTemplate | None = None
-    """The subject's mesh in the canonical pose, where the data set has one."""
+    """Mesh of the subject in the canonical pose; None if the data set has none."""
     betas: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    """[S], shape parameters of the body model; none without one."""
+    """[S], shape parameters of the body model; S is 0 without a body model."""
     sources: tuple[str, ...] = ()
-    """What the subject was made from, such as the body's file: printed, and written to the manifest."""
+    """Origin of the data, such as the file of the body; printed, and written to the manifest."""
     broken: tuple[tuple[str, str], ...] = ()
-    """Sequences that cannot be used, and why."""
+    """Name and reason of each sequence that cannot be used."""
     is_planar: bool = False
     """Whether it is two-dimensional: its meshes are prisms along z, and only the plane z = 0 is sampled."""
 

@@ -89,9 +89,9 @@ def test_feet_reach_everyones_own_floor(subjects):
 
 
 def test_unknown_subject():
-    with pytest.raises(UserError, match=r"no built-in subject '50003'; did you mean '500\d\d'\? Known are 50002, 50004"):
+    with pytest.raises(UserError, match=r"no built-in subject '50003'; did you mean '500\d\d'\? Wanted one of 50002, 50004"):
         builtin_subject("50003")
-    with pytest.raises(UserError, match=r"no built-in subject 'me'. Known are"):
+    with pytest.raises(UserError, match=r"no built-in subject 'me'. Wanted one of"):
         builtin_subject("me")
 
 

@@ -97,7 +97,7 @@ def test_broken_frames_are_left_out(root: Path, caplog: pytest.LogCaptureFixture
 
 
 def test_what_is_missing_is_named(root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    with pytest.raises(UserError, match="subject 32 wears 00032_blazerlong, 00032_longshort; name one"):
+    with pytest.raises(UserError, match="subject 32: wanted one outfit, got 00032_blazerlong, 00032_longshort; name one"):
         load(root, "32")
     with pytest.raises(UserError, match="no CAPE subject '00033_longshort'; did you mean '00032_longshort'"):
         load(root, "00033_longshort")
@@ -107,7 +107,7 @@ def test_what_is_missing_is_named(root: Path, tmp_path_factory: pytest.TempPathF
         load(tmp_path_factory.mktemp("empty"))
     minimal = root / "cape_release" / "minimal_body_shape" / "00032" / "00032_minimal.npy"
     np.save(minimal, np.zeros((10, 3)))
-    with pytest.raises(UserError, match=r"00032_minimal.npy must be finite numbers of shape \[6890, 3\], got \[10, 3\]"):
+    with pytest.raises(UserError, match=r"00032_minimal.npy: wanted finite numbers of shape \[6890, 3\], got \[10, 3\]"):
         load(root)
     (root / "cape_release" / "misc" / "subj_genders.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR.")
     with pytest.raises(UserError, match=r"subj_genders.pkl"):

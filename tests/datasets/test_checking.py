@@ -112,12 +112,12 @@ def test_broken_sequences_and_missing_things_are_problems_without_a_trace(caplog
     code, lines = checked(caplog, bad)
     assert code == 2
     assert "PROBLEM: sit: " in line_with(lines, "  broken ")
-    assert "has 3 meshes, but poses.npz has 4 frames" in line_with(lines, "  broken ")
+    assert "wanted 4 meshes, one per frame of poses.npz, got 3" in line_with(lines, "  broken ")
     (bad / "rex" / "skeleton.npz").write_bytes(b"nothing")
     code, lines = checked(caplog, bad)
     assert code == 2
     assert "PROBLEM: skeleton file" in line_with(lines, "  not usable ")
-    with pytest.raises(UserError, match="is not there"):
+    with pytest.raises(UserError, match="does not exist"):
         checked(caplog, bad.parent / "nothing")
 
 

@@ -113,7 +113,7 @@ def test_a_broken_recording_does_not_hide_the_person(tmp_path: Path) -> None:
     first.write_bytes(first.read_bytes()[:500])
     subject = load(tmp_path)
     assert [name for name, _ in subject.broken] == ["chicken_wings"]
-    assert "meant for SMPL-X" in subject.sources[1]
+    assert "made for SMPL-X" in subject.sources[1]
     np.testing.assert_array_equal(subject.betas, BETAS[:10])
     for path in first.parent.iterdir():
         path.write_bytes(b"")
@@ -162,7 +162,7 @@ def test_what_is_missing_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixtu
     assert "no PosePrior (MPI_Limits) below" in caplog.text
     reasons = dict(subject.broken)
     assert sorted(reasons) == ["hips", "knees"]
-    assert "there is no file of it" in reasons["hips"]
+    assert "has no file below" in reasons["hips"]
     assert "50002_knees_poses.npz" in reasons["knees"]
     with pytest.raises(UserError, match=r"no PosePrior sequences below .*MPI_Limits/03099/op2_poses.npz"):
         load(tmp_path, "poseprior")

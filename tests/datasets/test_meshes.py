@@ -14,7 +14,7 @@ from toy_animal import ANIMAL_CLIPS, Animal, AnimalMotion, animal_motion, make_a
 from toy_animal_files import animal_glb, write_animal_bvh, write_animal_meshes, write_mesh
 
 from snarfcli.datasets import meshes
-from snarfcli.datasets.recorded_sequence import World
+from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.subjects import SubjectData
@@ -136,7 +136,7 @@ def test_equal_numbers_give_equal_samples(routes, tmp_path):
 
 def test_other_units_and_axes_make_no_difference(routes, animal, tmp_path):
     """The same animal in centimetres and z up."""
-    turn = World(100.0, "z").turn.T  # from y up to z up
+    turn = FileToWorld(100.0, "z").turn.T  # from y up to z up
     rex = tmp_path / "rex"
     shutil.copytree(routes["poses"] / "rex", rex)
     skeleton = {"names": animal.names, "parents": animal.parents, "joints_rest": 100 * animal.joints @ turn.T, "up": "z"}
@@ -147,10 +147,10 @@ def test_other_units_and_axes_make_no_difference(routes, animal, tmp_path):
         for frame, vertices in enumerate(animal.posed(motion)):
             write_mesh(rex / motion.name / f"frame_{frame}.obj", 100 * vertices @ turn.T, animal.faces)
     same_subject(meshes.load("rex", request(routes["poses"])), meshes.load("rex", request(tmp_path)))
-    transforms = World(1.0, "z").transforms(transforms_of(animal, motions()[0]))
+    transforms = FileToWorld(1.0, "z").transforms(transforms_of(animal, motions()[0]))
     point = np.array([0.1, 0.2, 0.3, 1.0])
-    turned = World(1.0, "z").matrix @ point
-    expected = World(1.0, "z").matrix @ transforms_of(animal, motions()[0])[3, 5] @ point
+    turned = FileToWorld(1.0, "z").matrix @ point
+    expected = FileToWorld(1.0, "z").matrix @ transforms_of(animal, motions()[0])[3, 5] @ point
     np.testing.assert_allclose(transforms[3, 5] @ turned, expected, atol=1e-12)
 
 
@@ -250,7 +250,7 @@ def test_the_canonical_pose_is_the_files_or_the_rest(routes, animal, tmp_path):
     for canonical, angle in (("auto", 0.3), ("rest", 0.0)):
         subject = meshes.load("rex", request(tmp_path / "data", canonical=canonical))
         assert float(subject.skeleton.canonical_pose[4, 0]) == pytest.approx(angle)
-    with pytest.raises(UserError, match="legs_apart needs joints named l_hip and r_hip"):
+    with pytest.raises(UserError, match="legs_apart: wanted joints named l_hip and r_hip"):
         meshes.load("rex", request(tmp_path / "data", canonical="legs_apart"))
 
 
@@ -278,7 +278,7 @@ def with_leaf(animal: Animal, chosen: list[AnimalMotion]) -> tuple[Animal, list[
 def test_last_joints_that_move_nothing_are_left_out(routes, animal, tmp_path):
     (tmp_path / "rex.glb").write_bytes(animal_glb(*with_leaf(animal, motions())))
     subject = meshes.load("rex", request(tmp_path))
-    assert any(line.startswith("2 last joints that move no vertex were left out (ear, ear_end)") for line in subject.sources)
+    assert any(line.startswith("2 end joints that move no vertex were left out (ear, ear_end)") for line in subject.sources)
     assert subject.template.weights.shape[1] == subject.skeleton.num_joints == 19
     same_subject(meshes.load("rex", request(routes["glb"])), subject)
 
@@ -306,13 +306,13 @@ def test_files_of_two_skeletons_are_told_apart(animal, tmp_path):
     joints = animal.joints.copy()
     joints[4] += (0, 0.3, 0)
     (tmp_path / "rex" / "b.glb").write_bytes(animal_glb(replace(animal, joints=joints), motions("walk")))
-    with pytest.raises(UserError, match=r"b.glb has 'head' at another distance of its parent than a.glb"):
+    with pytest.raises(UserError, match=r"b.glb: 'head': wanted the distance to its parent of a.glb"):
         meshes.load("rex", request(tmp_path))
 
 
 def test_a_rig_without_animation_is_refused(animal, tmp_path):
     (tmp_path / "rex.glb").write_bytes(animal_glb(animal, []))
-    with pytest.raises(UserError, match=r"rex.glb has no animation; an avatar is learned from motion"):
+    with pytest.raises(UserError, match=r"rex.glb has no animation, which an avatar is learned from"):
         meshes.load("rex", request(tmp_path))
 
 
@@ -326,11 +326,11 @@ def test_sequences_that_cannot_be_used_are_listed(animal, tmp_path):
     subject = meshes.load("rex", request(tmp_path))
     assert [(spec.name, spec.split) for spec in subject.sequences] == [("walk", "test")]  # as if all were whole
     reasons = dict(subject.broken)
-    assert "has 4 meshes, but poses.npz has 5 frames; wanted one mesh a frame" in reasons["sit"]
-    assert "must hold one pose file (poses.npz, poses.json, motion.bvh), there is none" in reasons["sniff"]
-    assert "poses has NaN" in reasons["trot"]
+    assert "wanted 5 meshes, one per frame of poses.npz, got 4" in reasons["sit"]
+    assert "wanted one pose file (poses.npz, poses.json, motion.bvh), got none" in reasons["sniff"]
+    assert "poses: wanted finite numbers" in reasons["trot"]
     (rex / "walk" / "poses.npz").write_bytes(b"")
-    with pytest.raises(UserError, match=r"\(3 more sequences cannot be used\)"):
+    with pytest.raises(UserError, match=r"\(and 3 more sequences cannot be used\)"):
         meshes.load("rex", request(tmp_path))
 
 
@@ -342,16 +342,16 @@ def test_a_motion_of_another_skeleton_is_named(animal, tmp_path):
     write_animal_bvh(tmp_path / "rex" / "trot" / "motion.bvh", larger, animal_motion("trot", FRAMES))
     reasons = dict(meshes.load("rex", request(tmp_path)).broken)
     assert "sit/motion.bvh has no joint 'pelvis'" in reasons["sit"]
-    assert "elsewhere at rest than the skeleton" in reasons["trot"]
+    assert "at rest: wanted the position of the skeleton" in reasons["trot"]
 
 
 def test_what_is_missing_is_said(animal, tmp_path):
-    with pytest.raises(UserError, match=r"the folder of meshes .*nothing is not there; give data.folder=FOLDER"):
+    with pytest.raises(UserError, match=r"the folder of meshes .*nothing does not exist; give data.folder=FOLDER"):
         meshes.subjects(request(tmp_path / "nothing"))
     with pytest.raises(UserError, match=r"no subject in .*; wanted a rigged <subject>.glb"):
         meshes.subjects(request(tmp_path))
     (tmp_path / "cat").mkdir()
-    with pytest.raises(UserError, match=r"no subject in .*cat has no skeleton: neither skeleton.json"):
+    with pytest.raises(UserError, match=r"no subject in .*cat has no skeleton: wanted skeleton.json"):
         meshes.subjects(request(tmp_path))
     with pytest.raises(UserError, match=r"cat has no skeleton"):
         meshes.load("cat", request(tmp_path))
@@ -361,16 +361,16 @@ def test_what_is_missing_is_said(animal, tmp_path):
         meshes.load("rax", request(tmp_path))
     with pytest.raises(UserError, match=r"data.up: wanted auto, y or z, got 'x'"):
         meshes.load("rex", request(tmp_path, up="x"))
-    with pytest.raises(UserError, match=r"data.scale must be auto or a number .* got 'cm'"):
+    with pytest.raises(UserError, match=r"data.scale: wanted auto or metres per unit .* got 'cm'"):
         meshes.load("rex", request(tmp_path, scale="cm"))
     with pytest.raises(UserError, match=r"data.test: no sequence 'wlak'"):
         meshes.load("rex", request(tmp_path, test=["wlak"]))
     (tmp_path / "rex" / "split.json").write_text('{"tests": []}')
-    with pytest.raises(UserError, match=r"split.json must be an object such as"):
+    with pytest.raises(UserError, match=r"split.json: wanted an object such as"):
         meshes.load("rex", request(tmp_path))
     (tmp_path / "rex" / "split.json").unlink()
     shutil.copy(tmp_path / "rex" / "skeleton.npz", tmp_path / "rex" / "skeleton.json")
-    with pytest.raises(UserError, match=r"has two skeletons, skeleton.json and skeleton.npz; leave one"):
+    with pytest.raises(UserError, match=r"wanted one skeleton, got skeleton.json and skeleton.npz; remove one"):
         meshes.load("rex", request(tmp_path))
 
 

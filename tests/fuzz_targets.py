@@ -1,4 +1,4 @@
-"""The readers that are fed with broken files, one function each; what they need is imported only when one is called.
+"""Targets of the fuzzer, one function per reader; a function imports its reader when it is called.
 
 To add a reader, add a function with `@_target` anywhere below: its name is what `tools/fuzz_readers.py --only` takes.
 """
@@ -13,7 +13,7 @@ from fuzzing import Target
 __all__ = ["TARGETS"]
 
 TARGETS: list[Callable[[], Target]] = []
-"""Each makes one target, of the function's name."""
+"""Functions that each return one target with the name of the function."""
 
 
 def _target(make: Callable[[], Target]) -> Callable[[], Target]:
@@ -127,7 +127,7 @@ def _with_broken_json(rng: random.Random, content: bytes) -> bytes:
 
 @_target
 def pickle() -> Target:
-    """Plain data, arrays and sparse matrices in every protocol, and what Python 2 and chumpy wrote."""
+    """Plain data, arrays and sparse matrices in every protocol, and files of Python 2 and chumpy."""
     import pickle
     from pathlib import Path
 
@@ -191,7 +191,7 @@ def body_npz() -> Target:
 
 @_target
 def skeleton() -> Target:
-    """Skeletons and poses as users write them, in JSON."""
+    """Skeletons and poses in JSON."""
     from skeleton_damage import damaged_json, read_both, seeds_json
 
     return Target("skeleton", ".json", seeds_json, read_both, damaged_json)
@@ -199,7 +199,7 @@ def skeleton() -> Target:
 
 @_target
 def skeleton_npz() -> Target:
-    """The same in archives."""
+    """Skeletons and poses in archives."""
     from skeleton_damage import damaged_npz, read_both, seeds_npz
 
     return Target("skeleton_npz", ".npz", seeds_npz, read_both, damaged_npz)
@@ -307,7 +307,7 @@ def motion_npz() -> Target:
 
 
 def _odd_npz(rng: random.Random, content: bytes) -> bytes:
-    """Another archive: the arrays of the seed with shapes, types and values that they should not have."""
+    """Return another archive: the arrays of the seed with wrong shapes, types and values."""
     import io
 
     import numpy as np

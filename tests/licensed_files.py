@@ -1,4 +1,4 @@
-"""Files in the layouts of licensed data sets: the built-in body stands for SMPL's, its motions for the recordings."""
+"""Files in the layouts of licensed data sets: the built-in body replaces SMPL's, its motions the recordings."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def write_body(folder: Path, gender: str = "female") -> Path:
 
 
 def amass_poses(name: str, frames: int = FRAMES, dtype: type = np.float64) -> np.ndarray:
-    """Return SMPL's poses [T, 72] of a made-up recording, another one for every name; hands straight."""
+    """Return poses [T, 72] of SMPL, radians, random per name; hands straight."""
     motion = builtin_motion("punching", seed=sum(name.encode()), duration_s=frames / 60)
     poses = motion.poses.reshape(frames, 72).astype(dtype)
     poses[:, 66:] = 0
@@ -91,7 +91,7 @@ def write_dfaust(root: Path, subject: str = "50002", release: str = "old", neste
 
 
 def write_cape(root: Path, person: str = "00032", outfits: dict[str, tuple[str, ...]] | None = None) -> Path:
-    """Write a CAPE release: six frames a sequence, meshes that stand 1 cm off the body; return its folder."""
+    """Write a CAPE release: six frames per sequence, meshes 1 cm off the body; return its folder."""
     body = builtin_body()
     release = root / "cape_release"
     minimal = body.v_template.numpy() * np.float32(0.98)

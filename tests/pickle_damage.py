@@ -1,4 +1,4 @@
-"""Damage to pickles that is aimed at how they are read: other opcodes, sizes and memo numbers, and bodies that do not fit."""
+"""Damage to pickles that targets their reader: other opcodes, sizes and memo numbers, and bodies that do not fit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PIECES = (
 
 
 def damaged(rng: random.Random, content: bytes) -> bytes:
-    """Change a pickle between its opcodes, so that most of it still says something."""
+    """Change a pickle between its opcodes, so that most of it stays valid."""
     for _ in range(rng.choice([1, 1, 2, 5])):
         content = _changed(rng, content)
     return content
@@ -76,7 +76,7 @@ def damaged_body(rng: random.Random, content: bytes) -> bytes:
 
 
 def damaged_arrays(rng: random.Random, arrays: dict) -> dict:
-    """Change one to three arrays of a body: type, shape, values, or what they are."""
+    """Change one to three arrays of a body: type, shape, values, or kind."""
     arrays = dict(arrays)
     for key in rng.sample(sorted(arrays), rng.choice([1, 1, 2, 3])):
         array = arrays[key]

@@ -1,4 +1,4 @@
-"""Skeleton and pose files for the fuzzer, and wrong values put where right ones were."""
+"""Skeleton and pose files for the fuzzer, and damage that replaces values by wrong ones."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def seeds_npz() -> list[bytes]:
 
 
 def damaged_json(rng: random.Random, content: bytes) -> bytes:
-    """Put a wrong value in the place of a key's, or somewhere inside it."""
+    """Replace the value of a key, or a part of it, by a wrong one."""
     values = json.loads(json.dumps(rng.choice([_SKELETON, _POSES, _TRANSFORMS])))
     key = rng.choice(list(values))
     holder, place = values, key
@@ -62,7 +62,7 @@ def damaged_json(rng: random.Random, content: bytes) -> bytes:
 
 
 def damaged_npz(rng: random.Random, content: bytes) -> bytes:
-    """Give an array another type, other dimensions, or numbers that are none."""
+    """Give an array another type, other dimensions, or numbers that are not finite."""
     values = dict(rng.choice([_SKELETON, _POSES, _TRANSFORMS]))
     key = rng.choice(list(values))
     array = np.array(values[key])

@@ -1,4 +1,4 @@
-"""Body files in the forms in which SMPL, SMPL-H and SMPL-X are given out, made from the built-in body and from toys."""
+"""Body files in the released forms of SMPL, SMPL-H and SMPL-X, made from the built-in body and from small examples."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def octahedron() -> dict[str, Any]:
 
 
 def smpl(shapes: int = 10) -> dict[str, Any]:
-    """The built-in body with SMPL's own types: float64, uint32, a sparse regressor; components beyond 10 are made up."""
+    """The built-in body with SMPL's own types: float64, uint32, a sparse regressor; components beyond 10 are random."""
     import torch
 
     body = builtin_body(torch.float64)
@@ -118,7 +118,7 @@ def pickled(arrays: dict[str, Any], *, chumpy: tuple[str, ...] = ("shapedirs",),
 
 
 class _Python2Pickler(pickle._Pickler):
-    """Writes text and bytes as Python 2 wrote its strings."""
+    """Write text and bytes as Python 2 wrote its strings."""
 
     dispatch: ClassVar = dict(pickle._Pickler.dispatch)
 

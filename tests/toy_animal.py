@@ -40,8 +40,8 @@ _HIND = {
     "lower": ((0.09, 0.30, -0.23), (0.0, -0.21, -0.06), 0.046, 0.034),
     "paw": ((0.09, 0.07, -0.29), (0.0, -0.025, 0.06), 0.036, 0.034),
 }
-_SMOOTH = 0.02  # metres over which capsules melt into each other
-_BLEND = 0.022  # metres over which weights change hands at a joint
+_SMOOTH = 0.02  # metres over which capsules are blended
+_BLEND = 0.022  # metres over which weights change at a joint
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +53,13 @@ class Animal:
     parents: tuple[int, ...]
     """-1 for the first; a parent comes before its children."""
     joints: NDArray[np.float64]
-    """[J, 3] metres."""
+    """[J, 3], metres."""
     vertices: NDArray[np.float64]
     """[V, 3] metres, a closed surface; a file's float32 holds them exactly."""
     faces: NDArray[np.int64]
     """[F, 3] outward."""
     weights: NDArray[np.float64]
-    """[V, J] at most four a vertex, rows sum to 1."""
+    """[V, J], at most four per vertex, rows sum to 1."""
 
     def place(self, poses: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return world_from_joint [T, J, 4, 4] of poses [T, J, 3] (axis-angle to the parent) and a translation [T, 3]."""
@@ -81,7 +81,7 @@ class Animal:
 
 @dataclass(frozen=True, eq=False)
 class AnimalMotion:
-    """Poses [T, J, 3] (axis-angle relative to the parent, radians) and translation [T, 3] (metres), 30 frames a second."""
+    """Poses [T, J, 3], axis-angle relative to the parent, radians, and translation [T, 3], metres, at 30 frames per second."""
 
     name: str
     poses: NDArray[np.float64]

@@ -13,7 +13,7 @@ __all__ = ["animal_glb", "write_animal_bvh", "write_animal_meshes"]
 
 
 def animal_glb(animal: Animal, motions: list[AnimalMotion]) -> bytes:
-    """Return a rigged GLB: one skin, one mesh, one clip for each motion (rotations of all joints, translation of the first)."""
+    """Return a rigged GLB: one skin, one mesh, one clip per motion (rotations of all joints, translation of the first)."""
     builder = GltfBuilder()
     count = len(animal.names)
     nodes = []

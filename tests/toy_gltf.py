@@ -15,7 +15,7 @@ _COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint
 
 
 class GltfBuilder:
-    """Collects arrays; `root` is the JSON, to be written by the test."""
+    """Collect arrays; `root` is the JSON, which the test fills in."""
 
     def __init__(self, **root: Any) -> None:
         self.root: dict[str, Any] = {"asset": {"version": "2.0"}, "bufferViews": [], "accessors": [], **root}

@@ -1,4 +1,4 @@
-"""Motions of SMPL's joints as rigs of other programs: other names, rest pose, units and axes; and as BVH text."""
+"""Motions of SMPL's joints as rigs with the names, rest poses, units and axes of other programs; and as BVH text."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MIXAMO_NAMES = _named(
 
 
 def a_pose() -> np.ndarray:
-    """[24, 3] arms half lowered, legs apart, elbows and knees a little bent, ankles level again."""
+    """Return a pose [24, 3], radians: arms half lowered, legs apart, elbows and knees slightly bent, feet level."""
     pose = np.zeros((24, 3))
     for name, turn in {
         "l_shoulder": (0, 0.1, -0.8), "r_shoulder": (0, -0.1, 0.8), "l_elbow": (0, -0.3, 0), "r_elbow": (0, 0.3, 0),

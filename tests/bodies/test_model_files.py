@@ -1,4 +1,4 @@
-"""Body files in every form people have: the same body from each, as an independent implementation poses it, or one line."""
+"""Body files in all released forms: the same body from each, posed as by an independent implementation; else one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The built-in subject set: ten different people, the papers' held-out sequences, nothing left to chance."""
+"""The built-in subjects: ten different shapes, the held-out sequences of the papers, reproducible results."""
 
 from __future__ import annotations
 

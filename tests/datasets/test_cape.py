@@ -1,4 +1,4 @@
-"""CAPE's layout, made up: registered meshes at the origin, broken frames left out, a split by sequence."""
+"""Generated files in CAPE's layout: registered meshes at the origin, damaged frames left out, a split by sequence."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_only_what_is_needed_of_a_file_is_read(root: Path) -> None:
     frame = root / "cape_release/sequences/00032/longshort_hips/longshort_hips.000001.npz"
     with np.load(frame) as arrays:
         content = dict(arrays)
-    np.savez(frame, **content, notes=np.array([{"a": 1}], object))  # a pickle inside, which nobody asked for
+    np.savez(frame, **content, notes=np.array([{"a": 1}], object))  # a pickle that must not be read
     np.testing.assert_array_equal(load(root).sequences[0].frames, [0, 2, 4])
     del content["transl"]
     np.savez(frame, **content)

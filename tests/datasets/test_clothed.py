@@ -1,4 +1,4 @@
-"""The built-in subjects in clothes: a closed surface off the body, skin that is the body's, folds that come with the pose."""
+"""The built-in subjects in clothes: a closed surface off the body, the skin of the body, folds that depend on the pose."""
 
 from __future__ import annotations
 

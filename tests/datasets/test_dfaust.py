@@ -1,4 +1,4 @@
-"""DFaust and PosePrior from AMASS files in every layout they come in, made up: the same samples by every route."""
+"""DFaust and PosePrior from generated AMASS files in every released layout: the same samples from each."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_odd_files_are_read_alike(tmp_path: Path) -> None:
 def test_files_of_other_archives_are_not_taken(old: Path, tmp_path: Path) -> None:
     write_dfaust(tmp_path, nested="archives/DFaust67")
     write_body(tmp_path)
-    for folder in ("MPI_mosh", "renamed", "MPImosh/MPI_mosh"):  # MoSh's people and exercises have the same names
+    for folder in ("MPI_mosh", "renamed", "MPImosh/MPI_mosh"):  # subjects and exercises of MoSh have the same names
         write_old(tmp_path / folder / "50002" / "jumping_jacks_poses.npz", amass_poses("knees"))
     write_old(tmp_path / "MPI_mosh" / "50009" / "jumping_jacks_poses.npz", amass_poses("knees"))
     assert_same(load(tmp_path), load(old), 0.0)

@@ -1,4 +1,4 @@
-"""Subjects of the user's own: every way to write one down gives the same subject, and what is wrong is named."""
+"""Subjects that users provide: all formats give the same subject, and errors are named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where meshes come from: what worker processes have to import for it."""
+"""Sources of posed meshes: what worker processes import, and which files count as changed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MODULES = ["cli.main", "datasets.cape_frames", "datasets.posed_meshes", "sample
 
 @pytest.mark.parametrize("module", [f"snarfcli.{name}" for name in _MODULES])
 def test_worker_processes_start_without_pytorch(module: str) -> None:
-    """Importing it takes longer than sampling ten frames; every task of `snarf preprocess` starts a process."""
+    """Importing PyTorch takes longer than sampling ten frames, and every task of `snarf preprocess` starts a process."""
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 

@@ -76,7 +76,7 @@ def test_weights_are_inverse_distances(sticks) -> None:
     for data in sticks.values():
         own = data.template.weights
         np.testing.assert_allclose(own.sum(1), 1, atol=1e-12)
-        assert not own[:, [0, 3]].any()  # root and tip move nothing of their own
+        assert not own[:, [0, 3]].any()  # root and tip move no vertex
 
 
 def test_template_is_a_closed_prism_of_the_right_size(sticks) -> None:
@@ -150,7 +150,7 @@ def test_meshes_are_moved_by_both_bones(sticks) -> None:
 
 
 def test_labels_are_the_union_of_what_is_moved(store: SampleStore) -> None:
-    """A point is inside if inside points are moved onto it: looked up in another triangulation, moved anew."""
+    """A point is inside if inside points are moved onto it, computed with another triangulation."""
     x, y = np.meshgrid(np.linspace(-_WIDE, _WIDE, 41), np.linspace(-_LONG, _LONG, 161))
     stick = np.stack([x.ravel(), y.ravel()], -1)
     is_border = (np.abs(stick) == [_WIDE, _LONG]).any(1)

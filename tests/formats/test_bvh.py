@@ -1,4 +1,4 @@
-"""Reading BVH: against the format worked out by hand, in every odd layout, and one line for each kind of broken file."""
+"""BVH files: results computed by hand, unusual layouts, and a one-line error for each kind of damage."""
 
 from __future__ import annotations
 

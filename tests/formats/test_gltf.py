@@ -234,7 +234,7 @@ def test_robot_of_rigid_parts(tmp_path):
     np.testing.assert_allclose(clip.world_from_joint[:, 1, :3, 3], [[0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1, 1, 0], [1, 2, 0]])
     np.testing.assert_allclose(clip.world_from_joint[:, 2, :3, 3], clip.world_from_joint[:, 1, :3, 3] + [0, 0.5, 0])
     vertices, faces = _read(tmp_path, _robot(), read_gltf_surface)
-    assert len(vertices) == 12  # the boxes share four corners, which are welded whatever joints they follow
+    assert len(vertices) == 12  # the boxes share four corners, which are welded although they follow different joints
     assert trimesh.Trimesh(vertices, faces, process=False).area == pytest.approx(2 * _BOX.area)
 
 

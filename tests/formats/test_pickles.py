@@ -1,4 +1,4 @@
-"""Pickles: what people have is read as Python reads it, everything else is refused by name, and nothing runs."""
+"""Pickles: plain data is read as Python reads it, other classes are rejected by name, and nothing is executed."""
 
 from __future__ import annotations
 

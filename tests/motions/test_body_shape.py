@@ -1,4 +1,4 @@
-"""Gender and shape parameters, however a file spells them."""
+"""Gender and shape parameters in all spellings of AMASS files."""
 
 from __future__ import annotations
 

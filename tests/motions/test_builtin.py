@@ -17,7 +17,7 @@ ALL = (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES)
 JOINT = {name: number for number, name in enumerate(SMPL_JOINT_NAMES)}
 SEEDS = (50002, 50021)
 
-# Degrees a second, measured worst over ten subjects: 930 (the elbow of a punch) and 466 (the shoulder, arms back to overhead).
+# Degrees per second, worst of ten subjects: 930 (the elbow of a punch) and 466 (the shoulder, arms back to overhead).
 FASTEST = {"exercise": 1200, "extreme": 600}
 
 
@@ -65,9 +65,9 @@ def test_speeds_are_human(motions, name):
         rotations = [Rotation.from_rotvec(frames.reshape(-1, 3)) for frames in (motion.poses[:-1], motion.poses[1:])]
         speed = np.degrees((rotations[0].inv() * rotations[1]).magnitude()) * motion.frame_rate
         assert speed.max() < fastest
-        assert np.sqrt(np.mean(speed**2)) > 20  # nobody freezes
+        assert np.sqrt(np.mean(speed**2)) > 20  # every subject keeps moving
         moved = np.abs(np.diff(motion.translation, axis=0)).max() * motion.frame_rate
-        assert moved < 3.0  # metres a second
+        assert moved < 3.0  # metres per second
 
 
 @pytest.mark.parametrize("name", ["chicken_wings", "hips", "punching", "shake_arms", "shake_hips", "shake_shoulders"])

@@ -1,4 +1,4 @@
-"""What the arrays of a pose file mean, in every layout, and one line for each kind of bad one."""
+"""Arrays of pose files in every layout, and a one-line error for each kind of damage."""
 
 from __future__ import annotations
 

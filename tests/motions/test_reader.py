@@ -1,4 +1,4 @@
-"""One reader for every kind of file: equal samples by every route, and one line for each kind of bad file."""
+"""Motion files of every format: equal motions from each, and a one-line error for each kind of damage."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def _frame(seed: int) -> FrameSamples:
     generator = np.random.default_rng(seed)
     cells = generator.integers(0, 65536, (_POINTS, 3)).astype(np.uint16)
     lower = generator.normal(size=3).astype(np.float32)
-    corners = 4 + seed % 3 if seed % 2 else 4  # some frames have a mesh of their own
+    corners = 4 + seed % 3 if seed % 2 else 4  # some frames have another mesh
     return FrameSamples(
         points=cells,
         occupied=generator.random(_POINTS) < 0.3,

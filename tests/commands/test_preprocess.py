@@ -45,7 +45,7 @@ def subject(monkeypatch: pytest.MonkeyPatch) -> list[SubjectData]:
 def _config(root: Path, **changes: Any) -> PreprocessConfig:
     return PreprocessConfig(**{
         "subject": "toy", "data": DataConfig("builtin", 1, 1, 1), "data_root": str(root), "points_per_frame": 400,
-        "surface_noise_m": 0.01, "padding": 0.1, "inside_test": "winding", "workers": 2, "seed": 0, "overwrite": False,
+        "surface_noise_m": 0.01, "padding": 0.1, "inside_test": "winding", "workers": 1, "seed": 0, "overwrite": False,
         "sequences": [], "skip_broken": False, "body": None, **changes,
     })  # fmt: skip
 
@@ -60,12 +60,12 @@ def test_samples_do_not_depend_on_workers_or_interruptions(
 ) -> None:
     caplog.set_level(logging.INFO)
     one, two = tmp_path / "one", tmp_path / "two"
-    preprocess.run(_config(one, workers=1))
+    preprocess.run(_config(one))
     assert "39 frames, 15600 samples in" in caplog.text
     assert "samples/s" in caplog.text
     assert "bytes per frame" in caplog.text
     assert "give different labels to 0.000 % of the points" in caplog.text
-    preprocess.run(_config(two, sequences=["fold"]))
+    preprocess.run(_config(two, sequences=["fold"], workers=2))
     assert [entry["name"] for entry in json.loads(_contents(two)["manifest.json"])["sequences"]] == ["fold"]
     caplog.clear()
     preprocess.run(_config(two, workers=0))
@@ -98,7 +98,7 @@ def test_samples_do_not_depend_on_workers_or_interruptions(
 
 
 def test_settings_are_not_mixed(tmp_path: Path, subject: list[SubjectData]) -> None:
-    few = {"sequences": ["fold"], "workers": 1}
+    few = {"sequences": ["fold"]}
     preprocess.run(_config(tmp_path, **few))
     before = _contents(tmp_path)
     with pytest.raises(UserError, match=r"other settings \(padding 0.1 -> 0.3, seed 0 -> 5\).*overwrite=true"):
@@ -135,17 +135,17 @@ def test_an_interrupted_run_leaves_whole_sequences_only(
     with monkeypatch.context() as patch:
         patch.setattr(SequenceWriter, "write_frame", stop_at_fold)
         with pytest.raises(type(problem)):
-            preprocess.run(_config(tmp_path, sequences=["wave", "fold"], workers=1))
+            preprocess.run(_config(tmp_path, sequences=["wave", "fold"]))
     assert {name.split("/")[1] for name in _contents(tmp_path) if "/" in name} == {"wave"}
     assert not [path for path in tmp_path.rglob(".*") if path.suffix != ".lock"]
     with pytest.raises(UserError, match="unfinished"):
         SampleStore.open(tmp_path, "builtin", "toy")
-    preprocess.run(_config(tmp_path, sequences=["wave", "fold"], workers=1))
+    preprocess.run(_config(tmp_path, sequences=["wave", "fold"]))
     assert len(SampleStore.open(tmp_path, "builtin", "toy").manifest["sequences"]) == 2
 
 
 def test_a_damaged_sequence_is_made_again(tmp_path: Path, subject: list[SubjectData]) -> None:
-    few = {"sequences": ["fold"], "workers": 1}
+    few = {"sequences": ["fold"]}
     preprocess.run(_config(tmp_path, **few))
     before = _contents(tmp_path)
     folder = tmp_path / "processed" / "builtin" / "toy"
@@ -168,7 +168,7 @@ def test_a_damaged_sequence_is_made_again(tmp_path: Path, subject: list[SubjectD
 def test_an_open_mesh_is_said_once(tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture) -> None:
     body = toy_body()
     subject[0] = toy_subject(body=replace(body, faces=body.faces[1:]))
-    few = {"sequences": ["fold"], "workers": 1}
+    few = {"sequences": ["fold"]}
     preprocess.run(_config(tmp_path, **few))
     assert caplog.text.count("is open, 3 boundary edges: labelled by winding number") == 1
     assert SampleStore.open(tmp_path, "builtin", "toy").manifest["sequences"][0]["boundary_edges"] == 3
@@ -244,9 +244,9 @@ def test_a_broken_sequence_stops_the_run_or_is_left_out(
         preprocess.run(_config(tmp_path))
     assert not list(tmp_path.iterdir())
     with pytest.raises(UserError, match=r"mesh 000031.obj is damaged; give skip_broken=true"):
-        preprocess.run(_config(tmp_path, sequences=["wave", "bend"], workers=1))
+        preprocess.run(_config(tmp_path, sequences=["wave", "bend"]))
     assert {name.split("/")[1] for name in _contents(tmp_path) if "/" in name} == {"wave"}  # what was complete stays
-    preprocess.run(_config(tmp_path, skip_broken=True))
+    preprocess.run(_config(tmp_path, skip_broken=True, workers=2))
     store = SampleStore.open(tmp_path, "builtin", "toy")
     assert [(entry["split"], entry["name"]) for entry in store.manifest["sequences"]] == [("test", "wave"), ("ood", "fold")]
     assert store.manifest["skipped"] == [

@@ -199,7 +199,7 @@ def _read(
     motion = builtin_motion(name or _MOTION, choice.motion_seed, frame_rate=choice.motion_frame_rate)
     if not is_smpl:
         raise UserError(
-            f"motion {motion.name} is for SMPL's 24 joints, the avatar has another skeleton with {skeleton.num_joints} joints; "
-            "give a motion for it by --pose FILE, such as .bvh, .glb or .npz"
+            f"motion: wanted one for the avatar's {skeleton.num_joints} joints, got {motion.name}, which is for SMPL's 24; "
+            "give a motion file by --pose FILE, such as .bvh, .glb or .npz"
         )
     return motion, None

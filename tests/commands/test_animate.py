@@ -193,7 +193,7 @@ def test_what_is_missing_beside_is_no_missing_frame(config, toy, monkeypatch, ca
     assert record["skipped"] == []
     assert [frame["file"] for frame in record["frames"]] == ["frame_000000.ply", "frame_000001.ply"]
     assert [entry["reason"] for entry in record["missing"]] == ["skinned surface: nothing there"] * 2
-    assert "2 of 2 frames lack something beside the avatar" in caplog.text
+    assert "2 of 2 frames lack a panel beside the avatar" in caplog.text
 
 
 def test_truth_is_shown_where_there_is_some(config, toy, tmp_path, monkeypatch):
@@ -309,7 +309,7 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"format": "stl"}, "format: wanted ply or obj, got 'stl'"),
         ({"up": "x"}, "up: wanted auto, y or z"),
         ({"hands": "fists"}, "hands: wanted rest or released, got 'fists'"),
-        ({"clip": "walk"}, "clip is for .bvh, .glb, .gltf files, got pose file .*wave.npz; leave it out"),
+        ({"clip": "walk"}, "clip: wanted a file ending in .bvh, .glb, .gltf, got pose file .*wave.npz; leave it out"),
         ({"resolution": 15}, "resolution: wanted 16 to 1024, got 15"),
         ({"keep_share": 1.5}, "keep_share: wanted 0 to 1, got 1.5"),
         ({"step": 0}, "step: wanted at least 1"),
@@ -331,7 +331,10 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"pose": None, "motion_frame_rate": 0.0}, "motion_frame_rate: wanted "),
         ({"azimuth_deg": float("nan")}, "azimuth_deg: wanted "),
         ({"pose": None, "motion_seed": -1}, "motion_seed: wanted at least 0"),
-        ({"pose": None}, "motion jumping_jacks is for SMPL's 24 joints, the avatar has 2 .*; give .* by --pose FILE"),
+        (
+            {"pose": None},
+            "motion: wanted one for the avatar's 2 joints, got jumping_jacks, .* 24; give .* by --pose FILE",
+        ),
         ({"pose": None, "motion": "jumping_jaks"}, "did you mean 'jumping_jacks'"),
         ({"pose": "nowhere.npz"}, "no pose file at nowhere.npz"),
         ({"subject": "50003"}, "no built-in subject '50003'"),

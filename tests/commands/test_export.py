@@ -93,7 +93,7 @@ def test_an_avatar_given_by_its_file_names_what_is_made_of_it(folder, toy, capsy
 def test_null_is_no_motion_file(folder, capsys):
     code, err = export(capsys, "pose=null", "motion=null")
     assert code == 2
-    assert "motion jumping_jacks is for SMPL's 24 joints" in err
+    assert "got jumping_jacks, which is for SMPL's 24" in err
     pose_file("walk.npz", 1)
     assert export(capsys, "pose=[walk.npz]", "motion=null")[0] == 0
 
@@ -298,7 +298,7 @@ def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
         (["output=."], "ending in .glb"),
         (["--pose", "nowhere.npz"], "no pose file at nowhere.npz"),
         (["--pose"], "--pose: wanted a value"),
-        (["motion=[jumping_jacks]"], f"motion jumping_jacks is for SMPL's 24 joints, the avatar has {JOINTS}"),
+        (["motion=[jumping_jacks]"], f"motion: wanted one for the avatar's {JOINTS} joints, got jumping_jacks"),
         (["motion=[jumping_jaks]"], "did you mean 'jumping_jacks'"),
         (["subject=50004"], "no avatar in .*50004"),
     ],

@@ -52,7 +52,7 @@ def test_another_body_or_data_set_has_none(subject):
         ground_truth_meshes(CHOICE, PLAIN, avatar_of(taller, data="builtin", subject="50004"), chosen, None)
     other = replace(CHOICE, data=DataConfig("dfaust", 8, 1, 1))
     for pose, what in ((None, "built-in motions"), ("a.npz", "pose files")):
-        with pytest.raises(UserError, match=f"no ground truth of {what} for data=dfaust; .* leave truth out"):
+        with pytest.raises(UserError, match=f"{what} have no ground truth with data=dfaust: .* leave truth out"):
             ground_truth_meshes(other, PLAIN, avatar_of(subject.skeleton, data="dfaust", subject="50004"), chosen, pose)
 
 

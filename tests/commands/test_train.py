@@ -125,7 +125,7 @@ def test_a_damaged_checkpoint_is_named_and_left(config):
         ("shape", {"activation": "tanh"}, "shape.activation"),
         ("shape", {"depth": 0}, "shape.depth: wanted at least 1, got 0"),
         ("training", {"poses_per_step": 0}, "training.poses_per_step: wanted at least 1"),
-        ("training", {"uniform_points": 0, "surface_points": 0}, "nothing could be learned"),
+        ("training", {"uniform_points": 0, "surface_points": 0}, "wanted at least one point, got 0 and 0"),
         ("training", {"joint_target": "own_"}, "training.joint_target: wanted halves, parent or own, .* did you mean 'own'"),
         ("training", {"learning_rate": float("nan")}, "training.learning_rate: wanted "),
     ],

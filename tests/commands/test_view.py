@@ -107,7 +107,7 @@ def test_the_page_is_served_and_opened(served, opened, caplog):
         server = served()
     address = f"http://127.0.0.1:{server.port}"
     assert opened == [address]
-    assert f"page: {address} (Ctrl-C ends it)" in caplog.text
+    assert f"page: {address} (Ctrl-C ends the server)" in caplog.text
     assert "ssh -L" not in caplog.text
     assert "anybody" not in caplog.text
     with urllib.request.urlopen(address, timeout=300) as answer:
@@ -204,7 +204,7 @@ def test_without_viser_one_line_before_any_work(config, monkeypatch, capsys):
         ({"resolution": 15}, "resolution: wanted 16 to 1024, got 15"),
         ({"step": 0}, "step: wanted at least 1"),
         ({"pose": ["nowhere.npz"]}, "no pose file at nowhere.npz"),
-        ({"motion": "jumping_jacks"}, "motion jumping_jacks is for SMPL's 24 joints"),
+        ({"motion": "jumping_jacks"}, "got jumping_jacks, which is for SMPL's 24"),
         ({"subject": "50004"}, 'no avatar in .*50004.*; run "snarf train subject=50004" or give ckpt=PATH'),
     ],
     ids=lambda value: ",".join(value) if isinstance(value, dict) else "",

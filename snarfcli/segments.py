@@ -1,4 +1,4 @@
-"""Distances to line segments: the skeleton as a rough picture of where a body is."""
+"""Distances to line segments, such as the bones of a skeleton."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["distance_to_segments", "segment_distances"]
 def segment_distances(points: Tensor, segments: Tensor) -> Tensor:
     """Return the distance of points [N, 3] to each of the segments [S, 2, 3] (start, end), [N, S], metres.
 
-    A segment may be a point.
+    A segment may have length 0.
     """
     start = segments[:, 0]
     along = segments[:, 1] - start

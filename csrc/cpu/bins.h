@@ -1,5 +1,5 @@
-// Which bins of the sorted queries a place or a box touches: the library that marks bins and the kernels that read them must
-// agree.
+// The bins of the sorted queries that a point or a box touches. The library, which marks bins, and the kernels, which read
+// them, must agree.
 #pragma once
 
 #include "kernels.h"

@@ -13,7 +13,7 @@
 
 namespace snarf {
 
-// Which nodes are a corner of an active cell; empty if all are.
+// Whether each node is a corner of an active cell; empty if all are.
 inline std::vector<uint8_t> used_nodes(const snarf_blending& blending) {
   std::vector<uint8_t> used;
   if (!blending.active) return used;

@@ -7,8 +7,8 @@
 //   place    counting sort of the queries into the bins
 //   search   blocks of cells, handed out one by one; every thread keeps its own list of roots
 // and through those of `Collect`, which sorts the roots by query, and within a query by cell, and drops duplicates on the
-// common face of two cells. Which thread found a root leaves no trace in the result, and a query's roots do not depend on the
-// other queries of the batch.
+// common face of two cells. The result does not depend on which thread found a root, and the roots of a query do not depend on
+// the other queries of the batch.
 #pragma once
 
 #include <algorithm>

@@ -1,4 +1,4 @@
-// Which instruction set's kernels run on this processor.
+// Chooses the kernels for the instruction set of this processor.
 #pragma once
 
 #include <algorithm>

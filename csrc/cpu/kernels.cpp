@@ -43,7 +43,7 @@ struct Search {
   int32_t cell;
 };
 
-// The grid as the shared mathematics knows it, in this instruction set's namespace.
+// The grid as the type of the shared mathematics, in the namespace of this instruction set.
 template <class S>
 Grid<S> grid_of(const Geometry<S>& geometry) {
   Grid<S> grid;
@@ -55,7 +55,7 @@ Grid<S> grid_of(const Geometry<S>& geometry) {
   return grid;
 }
 
-// Cells x .. x + width - 1 of a row, one a lane; beyond the end of the row the last node is repeated.
+// Cells x .. x + width - 1 of a row, one per lane; beyond the end of the row the last node is repeated.
 template <class S>
 void load_cells(const S* transforms, const Geometry<S>& geometry, int x, int y, int z, Cell<Lanes<S>>& out) {
   using V = Lanes<S>;
@@ -288,7 +288,7 @@ void search_part(Search<S>& search, const Part<S>& part, int64_t begin, int64_t 
     for (int m = 0; m < 3 * kMonomials; ++m) whole.c[m] = V(part.c[m]);
     halve_cell<V, S>(whole, shift, parts.cell);
     bound_cell<V, S>(parts.cell, parts.bounds, S(0.5) + face_tolerance<S>() * S(2) / part.scale);
-    // Which eighths may hold a root of a candidate, one lane an eighth.
+    // Which eighths may hold a root of a candidate, one lane per eighth.
     uint32_t some = 0;
     for (int64_t i = 0; i < count; ++i) {
       V offset[3];

@@ -1,4 +1,4 @@
-// What the search passes to the kernels, which are compiled once per instruction set (kernels.cpp), and what comes back.
+// Arguments and results of the kernels, which are compiled once per instruction set (kernels.cpp).
 // Plain data only: nothing here may instantiate a template of the standard library inside a kernel.
 #pragma once
 
@@ -29,10 +29,10 @@ struct Geometry {
 template <class S>
 struct SortedQueries {
   const S* at[3];        // coordinates, readable kBlock numbers beyond the end
-  const int32_t* query;  // which query stands there
+  const int32_t* query;  // index of the query
   const int32_t* begin;  // first query of each bin, [bins + 1]
   S lower[3], upper[3];  // region of the bins, metres
-  S per_metre;           // bins a metre
+  S per_metre;           // bins per metre
   int32_t bins[3];
 };
 
@@ -44,7 +44,7 @@ struct Root {
   S inverse[9];  // of dd/dx
 };
 
-// Where a thread puts its roots; `more` makes room when next == end.
+// The roots of a thread; `more` makes room when next == end.
 template <class S>
 struct RootSink {
   Root<S>* next;
@@ -118,11 +118,11 @@ struct Kernels {
   void (*blend_weights)(const BlendTask<S>&, const S* gradient, S* row, S* v_weights);
   // Adds the task's nodes to v_rows [B, J, kRow], the gradient by the bones.
   void (*blend_bones)(const BlendTask<S>&, const S* gradient, S* v_rows);
-  // Widens the box lower[3], upper[3] to hold `count` points [N, 3]; NaN is passed over.
+  // Widens the box lower[3], upper[3] to hold `count` points [N, 3]; NaN is ignored.
   void (*extent)(const S* points, int64_t count, S* lower, S* upper);
-  // Which bin each of `count` points [N, 3] lies in; -1 outside of the bins' region.
+  // The bin of each of `count` points [N, 3]; -1 outside the region of the bins.
   void (*bins)(const SortedQueries<S>&, const S* points, int64_t count, int32_t* bin);
-  // Bounds where a block's cells go.
+  // Bounds the posed images of a block's cells.
   void (*boxes)(const S* transforms, const Geometry<S>&, const Block&, BlockBoxes<S>&);
   // Finds the roots in one block's cells.
   void (*search)(const CompleteTask<S>&, const Block&, const BlockBoxes<S>&, Scratch<S>&, RootSink<S>&);

@@ -1,7 +1,7 @@
 // Packs of SIMD lanes behind the operators of a scalar, for the shared mathematics.
 //
-// GCC and Clang compile their vector types to whatever the translation unit's flags allow; other compilers get loops over
-// arrays.
+// GCC and Clang compile their vector types to the instructions that the flags of the translation unit allow; other
+// compilers get loops over arrays.
 #pragma once
 
 #include <stdint.h>
@@ -207,7 +207,7 @@ SNARF_HD void store(S* at, Lanes<S> value) {
   memcpy(at, &value.v, sizeof value.v);
 }
 
-// The numbers 0 to 11 of `width` rows as twelve packs, one lane a row.
+// The numbers 0 to 11 of `width` rows as twelve packs, one lane per row.
 template <class S>
 SNARF_HD void load_rows(const S* const* row, Lanes<S>* out) {
   constexpr int width = Lanes<S>::width;

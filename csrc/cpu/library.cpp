@@ -1,4 +1,4 @@
-// The C interface of the CPU library: arguments checked, number types told apart, exceptions kept inside.
+// The C interface of the CPU library: checks arguments, dispatches on the number type, and lets no exception out.
 #include <algorithm>
 #include <limits>
 #include <memory>
@@ -61,7 +61,7 @@ void implicit_backward(const snarf_field& field, const snarf_queries& queries, i
   if (v_transforms) std::fill(v_transforms, v_transforms + 12 * queries.poses * nodes, S(0));
   if (!roots || !queries.poses || !queries.count) return;
   const int threads = threads_for(queries, roots);
-  // Poses write to nodes of their own; those of a pose are cut into layers, whose owners pass over the same roots in the same
+  // Each pose writes to separate nodes. Those of a pose are cut into layers, whose threads read the same roots in the same
   // order.
   const int64_t slabs = std::min<int64_t>(layers, (threads + queries.poses - 1) / queries.poses);
   Queue transforms_queue(v_transforms ? queries.poses * slabs : 0, 1), points_queue(v_points ? queries.poses : 0, 1);
@@ -127,7 +127,7 @@ int in_number_type(int bytes, const Run& run) {
   return SNARF_OK;
 }
 
-// Runs a search and hands its roots out.
+// Runs a search and returns a handle of its roots.
 template <class Run>
 int search_with(const snarf_field* field, const snarf_queries* queries, snarf_roots** roots, int64_t* found, const Run& run) {
   if (!valid(field, queries) || !roots || !found) return SNARF_BAD_ARGUMENT;

@@ -13,7 +13,7 @@
 
 namespace snarf {
 
-constexpr int64_t kPointsPerThread = 256;  // fewer are not worth starting a thread for
+constexpr int64_t kPointsPerThread = 256;  // minimum per thread, below which starting one costs more
 
 inline NetworkKernel network_kernel() {
 #if defined(SNARF_X86_KERNELS)

@@ -1,4 +1,4 @@
-// What the library passes to the network's kernel (network.cpp), which is compiled once per instruction set. Plain data only.
+// Arguments of the network's kernel (network.cpp), which is compiled once per instruction set. Plain data only.
 #pragma once
 
 #include <stdint.h>
@@ -12,7 +12,7 @@ struct NetworkLayer {
   const float*
       weights;  // [outputs / kOutputs, inputs, kOutputs]; inputs: those of the layer before, the encoded point, the extras
   const float* bias;                // [outputs], padded
-  int32_t hidden, encoded, extras;  // how many of each; 0 where it takes none
+  int32_t hidden, encoded, extras;  // number of each; 0 for none
   int32_t outputs;                  // padded
   int32_t activation;               // 0: none, 1: ReLU, 2: softplus
 };
@@ -20,8 +20,8 @@ struct NetworkLayer {
 struct NetworkTask {
   const NetworkLayer* layers;
   int32_t layer_count;
-  int32_t widest;            // most outputs of a layer
-  const float* frequencies;  // radians a metre, [K]
+  int32_t widest;            // maximum number of outputs of a layer
+  const float* frequencies;  // radians per metre, [K]
   int32_t frequency_count;
   const float* segments;  // [S, 6]: start and end, metres
   int32_t segment_count;  // 0: nothing is added

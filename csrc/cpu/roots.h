@@ -1,4 +1,4 @@
-// The roots that the threads find: gathered, sorted by query, without duplicates, and handed out.
+// The roots of all threads: collected, sorted by query, without duplicates, and copied to the caller.
 #pragma once
 
 #include <algorithm>
@@ -10,7 +10,7 @@
 #include "snarf/api.h"
 #include "team.h"
 
-// What a handle of the C interface points to.
+// The object behind a handle of the C interface.
 struct snarf_roots {
   virtual ~snarf_roots() = default;
   virtual int64_t count() const = 0;
@@ -19,7 +19,7 @@ struct snarf_roots {
 
 namespace snarf {
 
-constexpr int64_t kWorkPerThread = 2048;  // queries, roots or nodes; less is not worth starting a thread for
+constexpr int64_t kWorkPerThread = 2048;  // queries, roots or nodes; minimum per thread
 
 // The roots that one thread found, in blocks that never move.
 template <class S>

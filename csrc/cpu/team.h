@@ -1,7 +1,6 @@
 // Threads that work through the phases of one call together.
 //
-// They live for one call only: between calls none of them takes time from the caller's own threads, and a forked process has
-// none to miss.
+// They exist for one call only: between calls they take no time from the caller's threads, and a forked process lacks none.
 #pragma once
 
 #include <atomic>
@@ -59,14 +58,14 @@ class Queue {
   std::atomic<int64_t> next_;
 };
 
-// Runs each phase on every thread, all threads finishing one phase before any starts the next. A phase that throws (out of
-// memory) ends the call; returns whether all went well.
+// Runs each phase on every thread; all threads finish a phase before any starts the next. A phase that throws (out of memory)
+// ends the call. Returns whether no phase threw.
 inline bool run_phases(int threads, const std::vector<std::function<void(int)>>& phases) {
   std::atomic<bool> failed{false};
   Barrier barrier(threads);
   const auto work = [&](int first, int last) {  // does the work of these threads
     for (const auto& phase : phases) {
-      // After a failure the threads still meet at every barrier: who left early would be waited for.
+      // After a failure the threads still meet at every barrier: the others would wait for one that left early.
       try {
         for (int thread = first; thread < last && !failed; ++thread) phase(thread);
       } catch (...) { failed = true; }
@@ -79,7 +78,7 @@ inline bool run_phases(int threads, const std::vector<std::function<void(int)>>&
     helpers.reserve(threads - 1);
     for (; started < threads - 1; ++started) helpers.emplace_back(work, started, started + 1);
   } catch (...) {
-    // The system gives no more threads: this one does the rest.
+    // The system grants no more threads: this one does the rest.
   }
   work(started, threads);
   for (auto& helper : helpers) helper.join();

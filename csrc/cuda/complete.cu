@@ -23,7 +23,7 @@
 namespace snarf {
 namespace SNARF_ISA {
 
-constexpr int kThreads = 128;       // most threads of a block
+constexpr int kThreads = 128;       // maximum number of threads per block
 constexpr int kCurvedThreads = 64;  // in search_curved, whose parts fill the shared memory in float64 (39 of 48 KB)
 constexpr float kFarthest = 1e30f;  // metres
 
@@ -343,7 +343,7 @@ __device__ void solve_curved(const Search<S>& a, const Grid<S>& grid, const Pair
 // Running sums over the block: sums[t] becomes that of the values of the threads 0 .. t. Returns the total.
 __device__ __forceinline__ long long sum_over_block(long long value, long long* sums) {
   const int t = threadIdx.x, threads = blockDim.x;
-  __syncthreads();  // whoever still read the last sums is done
+  __syncthreads();  // all threads have read the last sums
   sums[t] = value;
   for (int step = 1; step < threads; step *= 2) {
     __syncthreads();
@@ -370,7 +370,7 @@ __device__ __forceinline__ int owner_of(const long long* sums, long long& n) {
 }
 
 // Searches the items of one chunk: as many as the block has threads. kCurved: an item is an eighth of a curved cell, otherwise
-// a tame cell. kMost: most threads of a block.
+// a tame cell. kMost: maximum number of threads per block.
 template <class S, bool kCurved, int kMost>
 __device__ __forceinline__ void search_chunk(const Search<S>& a, const Grid<S>& grid, const Bins<S>& bins, long long chunk,
                                              long long chunks, long long items) {
@@ -459,7 +459,7 @@ __device__ __forceinline__ void search_chunk(const Search<S>& a, const Grid<S>& 
   }
 }
 
-// Searches all items of a pose, chunk by chunk; how many there are, only the device knows.
+// Searches all items of a pose, chunk by chunk; their number is known on the device only.
 template <class S, bool kCurved, int kMost>
 __device__ __forceinline__ void search_items(const Search<S>& a) {
   __shared__ Bins<S> bins;
@@ -474,7 +474,7 @@ __device__ __forceinline__ void search_items(const Search<S>& a) {
     search_chunk<S, kCurved, kMost>(a, grid, bins, chunk, chunks, items);
 }
 
-// At least four blocks on a multiprocessor: 127 registers a thread in float32 without a spill.
+// At least four blocks on a multiprocessor: 127 registers per thread in float32 without a spill.
 extern "C" __global__ void __launch_bounds__(kThreads, sizeof(Number) == 4 ? 4 : 2) search_tame(const Search<Number> a) {
   search_items<Number, false, kThreads>(a);
 }

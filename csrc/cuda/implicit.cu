@@ -1,9 +1,9 @@
 // The gradient of the roots by implicit differentiation (implicit.h, SNARF Eq. 14).
 //
-// DESIGN. One thread a root. The gradient by the query is summed by the thread of the query's first root over its roots, which
-// stand side by side: no atomics, the same every time. The gradient by the node transforms is added to the eight nodes of the
-// root's cell by atomics, 48 bytes each, on Hopper and later 16 bytes at a time; the order of these additions, and with it the
-// last bits of v_transforms, differs from run to run. Rows of padding (query B N) give nothing.
+// DESIGN. One thread per root. The gradient by the query is summed by the thread of the query's first root over its roots,
+// which stand side by side: no atomics, the same every time. The gradient by the node transforms is added to the eight nodes of
+// the root's cell by atomics, 48 bytes each, on Hopper and later 16 bytes at a time; the order of these additions, and with it
+// the last bits of v_transforms, differs from run to run. Rows of padding (query B N) give nothing.
 #include "snarf/grid.h"
 #include "snarf/implicit.h"
 

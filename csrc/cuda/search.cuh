@@ -1,4 +1,4 @@
-// What the kernels of a search share: their arguments, and how a root is reported.
+// Shared by the kernels of a search: their arguments, and the report of a root.
 //
 // Every kernel of a search takes the same structure by value; snarfcli/native/cuda.py fills it in. SNARF_NUMBER is float or
 // double: NVRTC compiles each source once for either.
@@ -32,7 +32,7 @@ struct Search {
   // Cells of the group.
   S* records;        // [P, C], Record
   int* list;         // [P, C]: numbers of the tame cells from the front, of the others from the back
-  int* listed;       // [P, 2]: how many of either
+  int* listed;       // [P, 2]: number of each
   unsigned* region;  // [P, 12]: ordered() bounds of the cells' boxes and of the queries: upper, -lower each
   // Queries of the group's poses, sorted into bins.
   int* bin_count;      // [P, bins]

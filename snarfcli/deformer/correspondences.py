@@ -100,8 +100,8 @@ def find_correspondences(
         search: settings of the search, or its name: "complete" (cell by cell, without start bones) or "broyden" (the papers',
             from one start per bone). None for the defaults of `SearchConfig`.
         active_cells: [D-1, H-1, W-1], bool, the cells in which a complete search looks for roots; None for all.
-        capacity: maximum number of roots to return. The results have this length whatever is found, and rows beyond the roots
-            have the query B * N; so nothing waits for a GPU, and the call can be captured in a CUDA graph. torch.compile with
+        capacity: maximum number of roots to return. The results always have this length, and rows beyond the roots have the
+            query B * N; so nothing waits for a GPU, and the call can be captured in a CUDA graph. torch.compile with
             fullgraph=True needs it too, or torch._dynamo.config.capture_dynamic_output_shape_ops.
         check: whether to check the values of transforms and weights; skipped on a GPU, where it would force a synchronisation.
 

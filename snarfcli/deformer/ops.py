@@ -227,7 +227,7 @@ def _check_default_kernel(tensor: Tensor, backend: str) -> None:
 
 
 def _register_native(operator: CustomOpDef, device_type: str, native: Callable, reference: Callable) -> None:
-    """Register `native` for one type of device, or `reference` where `backend`, the last argument, says so."""
+    """Register `native` for one type of device, replaced by `reference` depending on the last argument, `backend`."""
 
     @operator.register_kernel(device_type)
     def kernel(*arguments):

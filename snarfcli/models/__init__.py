@@ -1,1 +1,1 @@
-"""The systems of the papers behind one interface, and the avatar that a user keeps."""
+"""The systems of the papers behind one interface, and the trained field that is saved and queried."""

@@ -13,10 +13,10 @@ __all__ = ["BackD"]
 
 
 class BackD(PointwiseSystem):
-    """A network of the posed point and the pose gives the way to the canonical point.
+    """A network of the posed point and the pose predicts the displacement to the canonical point.
 
-    It starts from no displacement at all. Points are taken back with the root bone first, so that the network need not learn
-    where the body stands.
+    The displacement is almost zero before training. Points are first moved back with the root bone, so that the network need
+    not learn the position of the body.
 
     Arguments: as `PointwiseSystem`.
     """

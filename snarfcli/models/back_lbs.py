@@ -20,10 +20,11 @@ __all__ = ["BackLBS"]
 
 
 class BackLBS(PointwiseSystem):
-    """A network of the posed point and the pose gives skinning weights, whose blended transform is inverted.
+    """A network of the posed point and the pose predicts skinning weights, whose blended transform is inverted.
 
-    Everything else is as in forward skinning: canonical shape, losses, the skinning network's size and sharpness. With
-    `skinning.prior_falloff_m` the weights start from the distances to the posed bones, as ours do from the canonical ones.
+    All else is as in forward skinning: canonical shape, losses, size and sharpness of the skinning network. With
+    `skinning.prior_falloff_m` the weights start from the distances to the posed bones; in forward skinning they start from
+    those to the canonical bones.
 
     Arguments: as `PointwiseSystem`.
     """
@@ -65,7 +66,7 @@ class BackLBS(PointwiseSystem):
         precision: str = "highest",
         found: Found | None = None,
     ) -> Tensor:
-        # Canonical points have no weights here, but those of a bone move with it: that says which joints they see.
+        # Canonical points have no weights here, but points of a bone move with it, which gives their weights.
         index = torch.arange(len(points), device=points.device) % len(pose)
         weights = F.one_hot(owner, self.num_bones).to(points)
         return self.canonical_logits(points, self.condition(pose), index, precision, weights)

@@ -1,4 +1,4 @@
-"""Reading what `torch.save` wrote, without executing anything in it."""
+"""Read files of `torch.save` without executing anything in them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["load_checkpoint"]
 
 
 def load_checkpoint(path: str | Path, file_format: str, version: int, what: str) -> dict[str, Any]:
-    """Read a dict written by `torch.save` without executing anything in it.
+    """Read a dict written by `torch.save`, without executing anything in the file.
 
     Raises:
         UserError: the file is missing, damaged, of another kind or another version.
@@ -25,11 +25,11 @@ def load_checkpoint(path: str | Path, file_format: str, version: int, what: str)
         content = torch.load(path, map_location="cpu", weights_only=True)
     except OSError:
         raise
-    except Exception:  # damaged bytes raise whatever the unpickler stumbles over: IndexError, UnicodeDecodeError, ...
+    except Exception:  # damaged bytes raise many kinds: IndexError, UnicodeDecodeError, ...
         raise UserError(f"{what} {path} is truncated or is not a file of snarf; train it again or copy it again") from None
     if not isinstance(content, dict) or content.get("format") != file_format:
         raise UserError(f'{path} is not a snarf {what}; give the file that "snarf train" wrote')
     if content.get("version") != version:
         came = content.get("version")
-        raise UserError(f"{what} {path} has format version {came}, this snarf reads {version}; train it again")
+        raise UserError(f"{what} {path}: wanted format version {version}, got {came}; train it again")
     return content

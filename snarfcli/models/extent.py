@@ -1,4 +1,4 @@
-"""Where a subject lies in the canonical frame, judged from posed meshes and the skeleton alone."""
+"""The extent of a subject in the canonical frame, estimated from posed meshes and the skeleton."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def bone_segments(skeleton: Skeleton, joints: Tensor | None = None) -> Tensor:
 
 
 def bone_owners(skeleton: Skeleton) -> list[int]:
-    """Return the joint that each of the segments of `bone_segments` moves with: the parent."""
+    """Return the joint that moves each segment of `bone_segments`: the parent."""
     return [parent for parent, _ in skeleton.bones] + [leaf for leaf in _leaves(skeleton) if skeleton.parents[leaf] < 0]
 
 
 def weight_segments(skeleton: Skeleton) -> tuple[Tensor, list[int]]:
     """Return the segments [S, 2, 3] that move with each joint, canonical frame, metres, and their joints, S numbers.
 
-    A joint moves the segments to its children; a last joint, which has none, the point where it is.
+    A joint moves the segments to its children; a joint without children moves the point where it is.
     """
     joints = skeleton.canonical_joints
     pairs = skeleton.bones + [(leaf, leaf) for leaf in _leaves(skeleton)]
@@ -48,7 +48,7 @@ def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: 
     """
     joints = skeleton.canonical_joints.to(vertices)
     leaves = [(joint, joint) for joint in _leaves(skeleton)]
-    # What lies beyond a last joint (fingers, toes, skull) is as near to that joint as to the end of its parent's bone.
+    # Points beyond a last joint (fingers, toes, skull) are as near to that joint as to the end of its parent's bone.
     pairs = torch.tensor(leaves + skeleton.bones)
     ends, moved = joints[pairs], bone_transforms[pairs[:, 0]]
     posed = torch.einsum("src,sec->ser", moved[:, :3, :3], ends) + moved[:, None, :3, 3]

@@ -20,13 +20,13 @@ from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, Syste
 
 __all__ = ["FastSnarf", "FoundRoots", "blend"]
 
-_SAMPLES_M = 0.04  # most distance of the samples that judge a cell; a wrist is 5 cm thick
-_KEPT_RADIUS_M = 0.1  # cells with a corner this near to a bone are searched whatever the field says
-_GROWTH_M = 0.06  # how far the cells searched in training reach beyond what might be occupied
-_GROWTH_LOGIT = -3.0  # what might be occupied in training: 5 %
+_SAMPLES_M = 0.04  # largest distance between the samples of a cell; a wrist is 5 cm thick
+_KEPT_RADIUS_M = 0.1  # cells with a corner at most this far from a bone are always searched
+_GROWTH_M = 0.06  # margin of the cells searched in training around what might be occupied
+_GROWTH_LOGIT = -3.0  # logit that counts as "might be occupied" in training: 5 %
 _FINAL_M = 0.04
-_FINAL_LOGIT = -2.0  # what might be occupied afterwards, in a pose not sampled: 12 %
-_SURFACE_MOVES_M = 0.06  # how far the pose may move the canonical surface
+_FINAL_LOGIT = -2.0  # the same after training, for poses that were not sampled: 12 %
+_SURFACE_MOVES_M = 0.06  # largest displacement of the canonical surface by the pose
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class FastSnarf(System):
         config: architecture.
         skeleton: joint tree and canonical pose.
         grid: canonical box of the skinning weights.
-        surface: rough points of the body, [K, 3], canonical, metres; with the bones they say where to search at first.
-        template: of no use here.
-        field: weight field to use instead of the one that `config.skinning` describes; preset weights need it.
+        surface: [K, 3], rough points of the body, canonical, metres; with the bones they define the cells searched at first.
+        template: not used.
+        field: weight field to use instead of the one that `config.skinning` describes; needed for preset weights.
     """
 
     has_skinning_weights: ClassVar[bool] = True
@@ -71,7 +71,7 @@ class FastSnarf(System):
             config = replace(config, skinning=replace(config.skinning, name="mlp"))
         super().__init__(config, skeleton)
         if config.model.blend not in ("logit", "probability"):
-            raise ValueError(f"model.blend must be logit or probability, got {config.model.blend!r}")
+            raise ValueError(f"model.blend: wanted logit or probability, got {config.model.blend!r}")
         skinning, bones, num_bones = config.skinning, bone_segments(skeleton), skeleton.num_joints
         active = kept = prior = None
         if skinning.bone_radius_m is not None:
@@ -95,7 +95,7 @@ class FastSnarf(System):
         return FoundRoots(self.deformer(points, bone_transforms, weights=weights), weights)
 
     def shape_at(self, found: FoundRoots, pose: Tensor, precision: str = "highest") -> FieldSamples:
-        """Evaluate the shape network at the roots, and blend over those of a point in training, else take their maximum.
+        """Evaluate the shape network at the roots; a point gets their blend in training, and their maximum otherwise.
 
         Source: SNARF Eq. 9.
         """
@@ -113,14 +113,14 @@ class FastSnarf(System):
 
     @torch.no_grad()
     def occupied_cells(self, pose: Tensor, threshold: float = 0.0, reach_m: float = 0.0, precision: str = "highest") -> Tensor:
-        """Return which cells the canonical shape touches in any of several poses, bool [D-1, H-1, W-1].
+        """Return whether cells touch the canonical shape in any of several poses, [D-1, H-1, W-1], bool.
 
-        The shape is looked at where cells are active: elsewhere the network was never trained.
+        Only active cells are sampled: elsewhere the network was never trained.
 
         Args:
             pose: [P, J, 3] axis-angle, radians.
-            threshold: logit above which a sample counts as occupied; samples lie 4 cm apart or closer.
-            reach_m: cells this near to an occupied sample, along each axis, are returned too, active or not.
+            threshold: logit above which a sample counts as occupied; samples lie at most 4 cm apart.
+            reach_m: cells at most this far from an occupied sample, along each axis, are included, active or not.
             precision: of the shape network.
         """
         deformer = self.deformer
@@ -148,11 +148,11 @@ class FastSnarf(System):
         return F.max_pool3d(near, [factor + 1 for factor in finer], finer)[0, 0] > 0
 
     def refresh_cells(self, pose: Tensor, precision: str = "highest") -> None:
-        """Search from now on where the learned shape is, or could soon be; for training, every now and then.
+        """Recompute the active cells from the current shape; called periodically in training.
 
-        These are all cells within 6 cm of what is occupied, or nearly, in any of the poses [P, J, 3]; so the shape can grow in
-        every direction, beyond the first region too. Cells at the bones always stay. Nothing changes if every cell is to be
-        searched (skinning.bone_radius_m is null), in a search that has no cells, or while nothing is occupied.
+        They are all cells within 6 cm of what might be occupied in any of the poses [P, J, 3], so that the shape can grow in
+        every direction, also beyond the first region. Cells at the bones always stay active. Nothing changes if all cells are
+        searched (skinning.bone_radius_m is null), in a search without cells, or while nothing is occupied.
         """
         if self.search.name != "complete":
             return
@@ -161,10 +161,10 @@ class FastSnarf(System):
             self.deformer.set_active_cells(cells | self._kept_cells)
 
     def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
-        """Keep only the cells within 4 cm of what the learned shape might occupy in any of the poses [P, J, 3].
+        """Keep only the active cells within 4 cm of what the final shape might occupy in any of the poses [P, J, 3].
 
-        For a trained model: whatever is left out is empty in these poses, and what was never searched stays out. Nothing
-        changes if every cell is to be searched (skinning.bone_radius_m is null), or if nothing is occupied.
+        For a trained model: cells that are dropped are empty in these poses, and no cell is added. Nothing changes if all cells
+        are searched (skinning.bone_radius_m is null), or if nothing is occupied.
         """
         cells = self.occupied_cells(pose, _FINAL_LOGIT, _FINAL_M, precision) & self.deformer.active_cells
         if self._kept_cells is not None and bool(cells.any()):
@@ -196,15 +196,15 @@ class FastSnarf(System):
 
     @torch.no_grad()
     def far_points(self, count: int, bone_transforms: Tensor, generator: torch.Generator) -> Tensor:
-        """Return points drawn in the searched cells and moved as the poses do."""
+        """Return random points of the searched cells, moved by the poses."""
         canonical = self.deformer.random_canonical(count, generator)
-        weights = self.deformer.field(canonical)  # not those between the grid's nodes, which would take them all
+        weights = self.deformer.field(canonical)  # not interpolated on the grid, which would evaluate all its nodes
         return torch.stack([skin(canonical, weights, transforms) for transforms in bone_transforms])
 
     def freeze(self) -> None:
         """Evaluate the skinning weights at the grid's nodes once and keep them.
 
-        The frozen grid of weights that are searched directly (skinning.name "mlp") serves for `posed_box` alone.
+        For weights that are searched directly (skinning.name "mlp") only `posed_box` uses the frozen grid.
         """
         self.eval()
         self.deformer.freeze()
@@ -237,9 +237,9 @@ class FastSnarf(System):
 
 
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:
-    """Blend logits [M] over each query's correspondences to [B, N], smoothly, so that all of them get a gradient.
+    """Blend logits [M] over the correspondences of each query to [B, N], so that each of them gets a gradient.
 
-    The weights are a softmax over the real roots only, so that the result does not depend on how the roots were found.
+    The weights are a softmax over the roots of a query, so that the result does not depend on how the roots were found.
     A query without a root gets `NO_CORRESPONDENCE`.
 
     Source: SNARF Sec. 3.2 (after Eq. 9); the form on logits is ours, and keeps its gradient where occupancies saturate.
@@ -247,7 +247,7 @@ def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor
     values = logits if config.blend == "logit" else logits.sigmoid()
     scores = config.blend_sharpness * values
     total = found.batch * found.count
-    # One row more than queries: it takes what belongs to no query where a search was given a capacity.
+    # One row more than queries, for the padding of a search with a capacity, which belongs to no query.
     zeros = logits.new_zeros(total + 1)
     highest = zeros.scatter_reduce(0, found.query, scores.detach(), "amax", include_self=False)
     weights = (scores - highest[found.query]).exp()

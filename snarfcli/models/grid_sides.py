@@ -1,4 +1,4 @@
-"""How the nodes of the weight grid are shared out among the sides of a subject that is no person in a T-pose."""
+"""Divide the nodes of the weight grid among the sides of its box, for skeletons other than SMPL's."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _FEWEST_NODES = 4
 
 
 def with_grid_sides(skinning: SkinningConfig, surface: Tensor, skeleton: Skeleton) -> SkinningConfig:
-    """Return the settings for a subject's own proportions.
+    """Adapt the settings of the grid to the proportions of a subject.
 
-    They are written for SMPL's bodies, wide, high and flat (64 x 64 x 16 nodes). On any other skeleton the longest side takes
-    the margin that is meant for x, the shortest that for z, and as many nodes in all are laid out in cells as long as wide: an
-    animal is long where a person is flat.
+    The settings are for SMPL's bodies, which are wide, high and flat (64 x 64 x 16 nodes). For any other skeleton the longest
+    side gets the margin of x, the shortest that of z, and the same total number of nodes is laid out in cells that are about
+    cubes: an animal is long where a person is flat.
 
     Args:
-        skinning: settings; returned as they are for SMPL's joints.
-        surface: [K, 3] canonical surface points, metres.
-        skeleton: the subject's.
+        skinning: settings; returned unchanged for SMPL's joints.
+        surface: [K, 3], canonical surface points, metres.
+        skeleton: the subject's skeleton.
     """
     if skeleton.names == SMPL_JOINT_NAMES:
         return skinning

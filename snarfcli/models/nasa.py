@@ -1,4 +1,4 @@
-"""NASA: one occupancy network a bone, in the bone's own frame, and their union (Deng et al., ECCV 2020; SNARF Sec. 4.2)."""
+"""NASA: one occupancy network per bone, in the bone's frame, and their union (Deng et al., ECCV 2020; SNARF Sec. 4.2)."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from snarfcli.shape.network import LOGITS_PER_METRE
 __all__ = ["Nasa", "PartNetworks"]
 
 _LEAK = 0.1  # slope of the leaky ReLU for negative values (Deng et al.)
-_ON_SURFACE = 0.5  # wanted occupancy of a part at its own surface points (Deng et al.)
+_ON_SURFACE = 0.5  # target occupancy of a part at its surface points (Deng et al.)
 _POINTS_AT_ONCE = {"cpu": 1024, "cuda": 65_536}  # each is evaluated for every part; on a CPU small calls stay in the cache
-# Lengths are divided by these before they enter a network. Points: half the length of a part; with half metres the surface IoU
-# after 300 quick steps was 56 %, with this 63 %. The root joint in a bone's frame: how far it is away.
+# Lengths are divided by these before they enter a network. Points: half the length of a part; the surface IoU after 300 quick
+# steps was 63 % with this, 56 % with 0.5 m. Root joint in a bone's frame: its typical distance.
 _UNIT_M = 0.15
 _ROOT_UNIT_M = 0.5
 
@@ -49,14 +49,14 @@ class BoneFrames(Found):
 class Nasa(PointwiseSystem):
     """Parts that move rigidly with their bones and change their shape with the pose.
 
-    Each part sees a point in the frame of its bone, and a few numbers to which the pose, written as the place of the root joint
-    in the frames of all bones, is reduced for it alone. The union of the parts is the maximum over them. A loss gives each
-    surface point to the part with the largest true skinning weight. The loss that fills the bones applies where the pose moves
-    them. With `model.part_code=0` parts are rigid, which Deng et al. call NASA (R); otherwise they deform, NASA (D). The system
-    "piecewise" always has rigid parts.
+    The input of a part is a point in the frame of its bone and a code of a few numbers. The code is computed for each part from
+    the pose, which is given as the position of the root joint in the frames of all bones. The union of the parts is their
+    maximum. A loss assigns each surface point to the part with the largest ground-truth skinning weight. The loss that fills
+    the bones applies at their posed points. With `model.part_code=0` parts are rigid, which Deng et al. call NASA (R);
+    otherwise they deform, NASA (D). The system "piecewise" always has rigid parts.
 
-    Occupancies are learned by cross-entropy, as in all systems here; the paper has squared errors. Where the canonical shape of
-    the other systems corrects capsules around the bones (`shape.prior_radius_m`), each part corrects those of its own bone.
+    Occupancies are learned by cross-entropy, as in all systems here; the paper uses squared errors. The canonical shape of the
+    other systems corrects capsules around the bones (`shape.prior_radius_m`); here each part corrects those of its bone.
 
     Arguments: as `PointwiseSystem`.
     """
@@ -133,13 +133,13 @@ class Nasa(PointwiseSystem):
         precision: str = "highest",
         found: Found | None = None,
     ) -> Tensor:
-        """Return logits where each pose moves points of the bones, [B, M]: there is no canonical shape to fill."""
+        """Return logits at the posed points of the bones, [B, M], since there is no canonical shape."""
         return self(move_with_bones(points, owner, bone_transforms), bone_transforms, pose, precision).logits
 
     def extra_losses(
         self, bone_transforms: Tensor, pose: Tensor, generator: torch.Generator, precision: str = "highest"
     ) -> dict[str, Tensor]:
-        """Return the loss that wants each surface point on the border of its own part and outside all others.
+        """Return the loss that puts each surface point on the border of one part and outside all others.
 
         Source: Deng et al., the weight loss.
         """
@@ -157,7 +157,7 @@ class Nasa(PointwiseSystem):
 
 
 def _own_segments(skeleton: Skeleton) -> Tensor:
-    """Return the segments that move with each joint, relative to it, [J, S, 2, 3], metres; some more than once, to be S."""
+    """Return the segments that move with each joint, relative to it, [J, S, 2, 3], metres; repeated up to S per joint."""
     segments, owner = weight_segments(skeleton)
     own = [[one for one, joint in zip(segments, owner, strict=True) if joint == bone] for bone in range(skeleton.num_joints)]
     most = max(len(some) for some in own)
@@ -166,7 +166,7 @@ def _own_segments(skeleton: Skeleton) -> Tensor:
 
 
 class PartNetworks(nn.Module):
-    """As many small networks of equal size as there are bones, evaluated together.
+    """Small networks of equal size, one per bone, evaluated together.
 
     Args:
         config: their size.
@@ -178,7 +178,7 @@ class PartNetworks(nn.Module):
         width, depth = config.part_width, config.part_depth
         if width < 1 or depth < 1 or config.part_code < 0:
             raise ValueError(
-                "model.part_width and part_depth must be at least 1 and part_code at least 0, "
+                "model.part_width, part_depth, part_code: wanted at least 1, 1 and 0, "
                 f"got {width}, {depth} and {config.part_code}"
             )
         sizes = [3 + config.part_code] + [width] * depth + [1]
@@ -192,8 +192,8 @@ class PartNetworks(nn.Module):
         """Return the logits [B, J, N] at points [B, J, N, 3] in the frames of the bones.
 
         Args:
-            local: the points, in units of `_UNIT_M`.
-            roots: the root joint in the frames of the bones, [B, J, 3], in units of `_ROOT_UNIT_M`: the pose.
+            local: [B, J, N, 3], the points, in units of `_UNIT_M`.
+            roots: [B, J, 3], the pose: the root joint in the frames of the bones, in units of `_ROOT_UNIT_M`.
         """
         batch, bones, count = local.shape[:3]
         code = torch.einsum("bp,jpc->bjc", roots.flatten(1), self.reduce)
@@ -207,6 +207,6 @@ class PartNetworks(nn.Module):
 
 
 def _uniform(shape: tuple[int, ...], inputs: int) -> nn.Parameter:
-    """Return a parameter with independent entries as those of `nn.Linear` with so many inputs."""
+    """Return a parameter distributed as the weights of `nn.Linear` with this number of inputs."""
     bound = 1 / math.sqrt(inputs)
     return nn.Parameter(torch.empty(shape).uniform_(-bound, bound))

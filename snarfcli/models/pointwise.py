@@ -1,4 +1,4 @@
-"""Systems that take each posed point back, or judge it, by itself: no search, one canonical point for each posed one."""
+"""Systems without a search: they evaluate one canonical, or one posed, point for each posed point."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from snarfcli.segments import distance_to_segments
 
 __all__ = ["PointwiseSystem", "PosedNetwork", "every_point", "into_root_frame", "invert_blended", "move_with_bones"]
 
-_LEAST_DETERMINANT = 0.01  # of blended rotations; those of neighbouring bones bent by 150 degrees have 0.07
-_BOX_MARGIN_M = 0.06  # how far the pose may move the surface beyond where it lies in the training frames
+_LEAST_DETERMINANT = 0.01  # of blended rotations; that of neighbouring bones bent by 150 degrees is 0.07
+_BOX_MARGIN_M = 0.06  # largest displacement of the surface by the pose beyond the training frames
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class FoundPoints(Found):
 
 
 class PointwiseSystem(System):
-    """A system in which every posed point has exactly one place to look at.
+    """A system that evaluates exactly one point for each posed point.
 
     Args:
         config: architecture.
         skeleton: joint tree and canonical pose.
         grid: canonical box that holds the body.
-        surface: rough points of the body, [K, 3], canonical, metres; how far they lie from the bones bounds the posed body.
+        surface: [K, 3], rough points of the body, canonical, metres; their largest distance to the bones bounds the posed body.
         template: the subject's mesh, for systems that need it.
     """
 
@@ -69,7 +69,7 @@ class PointwiseSystem(System):
         self._build(skeleton, grid, template)
 
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
-        """Make what the system has besides its shape; the arguments are those of the constructor."""
+        """Build the parts of the system besides its shape; the arguments are those of the constructor."""
 
     def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
         with matmul_precision("highest"), torch.autocast(points.device.type, enabled=False):
@@ -83,7 +83,7 @@ class PointwiseSystem(System):
         return every_point(logits.reshape(batch, count))
 
     def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return where posed points [B, N, 3] come from, [B, N, 3], and by which skinning weights [B, N, J], if by any."""
+        """Return the canonical points [B, N, 3] of posed points [B, N, 3], and the skinning weights [B, N, J] used, if any."""
         raise NotImplementedError
 
     @property
@@ -91,7 +91,7 @@ class PointwiseSystem(System):
         return CanonicalGrid(self.lower, self.upper, checked=True)
 
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a box around the posed joints, as much wider as the body reaches beyond its bones."""
+        """Return the box around the posed joints, widened by the largest distance of the body from its bones."""
         joints = move_with_bones(self._joints, torch.arange(self.num_bones), bone_transforms[None])[0]
         return (joints.amin(0) - self.reach).cpu(), (joints.amax(0) + self.reach).cpu()
 
@@ -99,15 +99,15 @@ class PointwiseSystem(System):
 class PosedNetwork(nn.Module):
     """A network of a posed point and the pose, of the size of the skinning network.
 
-    The pose is joined to the point at the input. Its part of the first layer is the same for all points of a pose, so it is
-    evaluated once.
+    The pose is concatenated to the point at the input. Its part of the first layer is the same for all points of a pose, so it
+    is evaluated once.
 
     Args:
         pose_size: length of the pose.
-        outputs: numbers for each point.
+        outputs: number of outputs per point.
         config: width, depth and weight norm of the layers, from `skinning`.
         scale: lengths are divided by it, metres.
-        starts_at_zero: whether the output is zero, nearly, before training.
+        starts_at_zero: whether the output is almost zero before training.
     """
 
     scale: Tensor
@@ -146,7 +146,7 @@ def every_point(logits: Tensor) -> FieldSamples:
 
 
 def into_root_frame(points: Tensor, bone_transforms: Tensor) -> Tensor:
-    """Move posed points [B, N, 3] rigidly back with the root bone, so that no system has to learn where a body stands."""
+    """Move posed points [B, N, 3] rigidly back with the root bone, so that the position of the body need not be learned."""
     root = bone_transforms[:, 0]
     return (points - root[:, None, :3, 3]) @ root[:, :3, :3]  # a rotation's inverse is its transpose
 
@@ -160,8 +160,8 @@ def move_with_bones(points: Tensor, owner: Tensor, bone_transforms: Tensor) -> T
 def invert_blended(points: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
     """Move posed points back by linear blend skinning with given weights: the inverse of SNARF Eq. 4 for fixed w.
 
-    Blends of opposite rotations have no inverse; near them the determinant is kept away from zero, and points go far away
-    instead of nowhere.
+    Blends of opposite rotations have no inverse. Near them the determinant is kept away from zero, so that points go far away
+    but stay finite.
 
     Args:
         points: [B, N, 3], posed, metres.

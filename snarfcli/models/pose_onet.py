@@ -1,4 +1,4 @@
-"""Pose-ONet: an occupancy network that is told the pose beside each point (SNARF Sec. 4.2, Fast-SNARF Sec. 5.1.2)."""
+"""Pose-ONet: an occupancy network of posed point and pose (SNARF Sec. 4.2, Fast-SNARF Sec. 5.1.2)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["PoseONet"]
 
 
 class PoseONet(PointwiseSystem):
-    """The pose is joined to the posed point at the input of one network, which knows nothing of bones.
+    """The pose is concatenated to the posed point at the input of one network, which does not use bones.
 
-    Points are taken back with the root bone, so that the network need not learn where the body stands. The network is that of
-    the canonical shape but for the place where the pose enters and the capsules, which a pose would have to move. It takes the
-    whole pose, whatever `condition` says of canonical shapes.
+    Points are moved back with the root bone, so that the network need not learn the position of the body. The network is that
+    of the canonical shape, except that the pose enters at the input and that there are no capsules, which would have to move
+    with the pose. It takes the whole pose for every `condition`.
 
     Arguments: as `PointwiseSystem`.
     """
@@ -45,5 +45,5 @@ class PoseONet(PointwiseSystem):
         precision: str = "highest",
         found: Found | None = None,
     ) -> Tensor:
-        """Return logits where each pose moves points of the bones, [B, M]: there is no canonical shape to fill."""
+        """Return logits at the posed points of the bones, [B, M], since there is no canonical shape."""
         return self(move_with_bones(points, owner, bone_transforms), bone_transforms, pose, precision).logits

@@ -18,7 +18,7 @@ def read_preset_weights(path: str | Path, grid: CanonicalGrid, shape: tuple[int,
     """Read the skinning weights of a mesh and diffuse them into the grid.
 
     Args:
-        path: .npz file with `vertices` [V, 3], metres, in the canonical pose of the subject, and `weights` [V, J].
+        path: .npz file with `vertices` [V, 3], canonical pose of the subject, metres, and `weights` [V, J].
         grid: canonical box.
         shape: nodes (D, H, W).
         num_bones: J.

@@ -1,4 +1,4 @@
-"""What can be chosen about a system, and all that is needed to build one again."""
+"""Configuration of a system."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class ModelConfig:
     name: str = "fast_snarf"
     """Which system: fast_snarf, snarf, pose_onet, back_lbs, back_d, nasa, piecewise or smpl_nn."""
     blend: str = "logit"
-    """How correspondences of one point are blended in training: logit (softmax-weighted mean of the logits) or
-    probability (softmax-weighted mean of the occupancies, as in the papers); of forward skinning only."""
+    """How the correspondences of a point are blended in training: logit (softmax-weighted mean of the logits) or probability
+    (softmax-weighted mean of the occupancies, as in the papers); only for forward skinning."""
     blend_sharpness: float = 1.0
     """Factor before the softmax of the blend (5 on occupancies in the released code)."""
     part_width: int = 40
@@ -24,16 +24,16 @@ class ModelConfig:
     part_depth: int = 4
     """Number of hidden layers of each part's network."""
     part_code: int = 4
-    """Numbers to which the pose is reduced for each part; 0 for parts that do not deform."""
+    """Size of the code to which the pose is reduced for each part; 0 for parts that do not deform."""
     part_weight: float = 0.5
-    """Weight of the loss that gives each surface point to one part, by the true skinning weights."""
+    """Weight of the loss that assigns each surface point to one part, by ground-truth skinning weights."""
     part_points: int = 128
-    """Surface points of each frame of a step for that loss."""
+    """Number of surface points per frame of a step for that loss."""
 
 
 @dataclass
 class AvatarConfig:
-    """All that is needed to build an avatar's networks again."""
+    """Configuration from which the networks of an avatar are built."""
 
     model: ModelConfig
     skinning: SkinningConfig

@@ -16,13 +16,13 @@ from snarfcli.shape import CONDITIONS
 
 __all__ = ["SmplNN"]
 
-_PAIRS_AT_ONCE = 2**26  # distances in memory at once on a GPU
+_PAIRS_AT_ONCE = 2**26  # maximum number of distances in memory at once on a GPU
 
 
 class SmplNN(PointwiseSystem):
-    """The base mesh is moved by linear blend skinning; each query takes the weights of its nearest vertex and is moved back.
+    """The base mesh is moved by linear blend skinning; each query is moved back with the weights of its nearest vertex.
 
-    Nothing of the skinning is learned. The mesh is saved with the avatar, and its licence with it.
+    The skinning is not learned. The mesh is saved in the avatar's file, to which its licence then applies.
 
     Arguments: as `PointwiseSystem`; the template is that base mesh.
     """
@@ -59,6 +59,6 @@ def nearest_vertex(points: Tensor, vertices: Tensor) -> Tensor:
         finite = np.nan_to_num(points.detach().numpy(), posinf=1e6, neginf=-1e6)
         return torch.from_numpy(KDTree(vertices.detach().numpy()).query(finite)[1]).long()
     parts = points.split(max(1, _PAIRS_AT_ONCE // len(vertices)))
-    # By differences: as a matrix product, distances of a centimetre are wrong by millimetres some metres from the origin.
+    # From differences: from a matrix product, distances of 1 cm are wrong by millimetres some metres from the origin.
     exact = "donot_use_mm_for_euclid_dist"
     return torch.cat([torch.cdist(part, vertices, compute_mode=exact).argmin(1) for part in parts])

@@ -1,4 +1,4 @@
-"""Which bones start a Broyden search on a given skeleton."""
+"""The start bones of a Broyden search on a given skeleton."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def with_start_bones(search: SearchConfig, skeleton: Skeleton) -> SearchConfig:
     An empty list becomes the papers' nine bones where the joints are SMPL's, and all bones elsewhere.
 
     Raises:
-        UserError: a bone is given that the skeleton has not.
+        UserError: the skeleton does not have a given bone.
     """
     bones, count = search.init_bones, skeleton.num_joints
     if bones is None:
@@ -29,5 +29,5 @@ def with_start_bones(search: SearchConfig, skeleton: Skeleton) -> SearchConfig:
         is_smpl = skeleton.names == SMPL_JOINT_NAMES
         return replace(search, init_bones=[SMPL_JOINT_NAMES.index(name) for name in _PAPERS_BONES] if is_smpl else None)
     if not all(0 <= bone < count for bone in bones):
-        raise UserError(f"search.init_bones must lie in 0..{count - 1}, got {bones}; null starts from all bones")
+        raise UserError(f"search.init_bones: wanted bones from 0 to {count - 1}, got {bones}; null starts from all bones")
     return search

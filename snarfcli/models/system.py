@@ -1,4 +1,4 @@
-"""The interface of all systems: what training, evaluation and meshing ask of a posed occupancy field."""
+"""Interface of all systems: a posed occupancy field, as training, evaluation and meshing use it."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from snarfcli.shape.inference import can_evaluate, evaluate
 __all__ = ["NO_CORRESPONDENCE", "FieldSamples", "Found", "System", "pose_angles"]
 
 NO_CORRESPONDENCE = -30.0
-"""Logit of a point that no canonical point is moved onto: certainly outside."""
+"""Logit of a point without a correspondence, which is certainly outside."""
 
 _POINTS_AT_ONCE = 32_768  # canonical points in one call of the shape network; smaller calls stay in the cache
-_ROUND_NUMBER = 512  # of points in training: oneDNN compiles its matrix products anew for every size it has not met
+_ROUND_NUMBER = 512  # multiple of points in training: oneDNN compiles its matrix products again for every new size
 
 
 @dataclass
@@ -31,11 +31,11 @@ class FieldSamples:
     """Values of the posed field at B x N query points."""
 
     logits: Tensor
-    """[B, N], occupied where positive; `NO_CORRESPONDENCE` where there is none."""
+    """[B, N], occupied where positive; `NO_CORRESPONDENCE` for points without one."""
     found: Tensor
-    """Which points have a correspondence, bool [B, N]."""
+    """[B, N], bool, whether each point has a correspondence."""
     counts: Tensor
-    """Number of correspondences of each point, [B, N]."""
+    """[B, N], number of correspondences per point."""
 
     @property
     def correspondences(self) -> int:
@@ -55,8 +55,8 @@ def pose_angles(pose: Tensor) -> Tensor:
 class System(nn.Module):
     """A posed occupancy field of one subject that can be trained.
 
-    A system says what it does differently by overriding methods; those here belong to systems with a canonical shape that needs
-    no care beyond its gradients.
+    A system overrides the methods in which it differs; those here fit systems with a canonical shape that is trained by its
+    gradients alone.
 
     Args:
         config: architecture.
@@ -64,13 +64,13 @@ class System(nn.Module):
     """
 
     needs_template: ClassVar[bool] = False
-    """Whether training needs the subject's mesh with its true skinning weights."""
+    """Whether training needs the subject's mesh with ground-truth skinning weights."""
     keeps_template: ClassVar[bool] = False
-    """Whether the trained avatar needs it too, so that it is saved with it."""
+    """Whether the trained avatar needs that mesh too, so that it is saved in the avatar's file."""
     has_canonical_shape: ClassVar[bool] = True
     """Whether there is a surface in the canonical frame."""
     has_skinning_weights: ClassVar[bool] = False
-    """Whether there are skinning weights of canonical points, so that canonical points can be moved."""
+    """Whether canonical points have skinning weights, so that they can be moved."""
     conditions: ClassVar[tuple[str, ...]] = CONDITIONS
     """Ways in which its canonical shape can depend on the pose."""
     shape: OccupancyNetwork
@@ -82,7 +82,7 @@ class System(nn.Module):
         self.config = config
         name = config.condition.name
         if name not in CONDITIONS:
-            raise ValueError(f"condition.name must be one of {', '.join(CONDITIONS)}, got {name!r}")
+            raise ValueError(f"condition.name: wanted {', '.join(CONDITIONS[:-1])} or {CONDITIONS[-1]}, got {name!r}")
         if name not in self.conditions:
             known = ", ".join(self.conditions)
             raise ValueError(f"model {config.model.name} has no skinning weights for condition={name}; choose from {known}")
@@ -90,7 +90,7 @@ class System(nn.Module):
         self.register_buffer("_joints_of_bones", joints_of_bones(skeleton.parents), persistent=False)
 
     def _make_shape(self, bones: Tensor) -> OccupancyNetwork:
-        """Return the network that says what is occupied; `bones` [S, 2, 3] are the canonical ends of the bones, metres."""
+        """Return the occupancy network; `bones` [S, 2, 3] are the canonical ends of the bones, metres."""
         shape, condition = self.config.shape, self.config.condition
         if condition.layer is not None:
             shape = replace(shape, condition_layer=condition.layer)
@@ -136,8 +136,8 @@ class System(nn.Module):
         Args:
             canonical: [M, 3], metres.
             condition: [B, C].
-            pose: index of each point's pose, [M].
-            precision: of the network, but not where the native library evaluates it, which is in full float32 and faster.
+            pose: [M], index of each point's pose.
+            precision: of the network; no effect where the native library evaluates it, which is in full float32 and faster.
             weights: skinning weights of the points [M, J], used if `depends_on_weights`; None to evaluate them here.
         """
         seen = None
@@ -160,10 +160,10 @@ class System(nn.Module):
 
     @torch.no_grad()
     def seen_joints(self, weights: Tensor) -> Tensor:
-        """Return how much points of skinning weights [M, J] see of each joint but the root, [M, J - 1], 0 to 1.
+        """Return the share of each joint but the root in the condition of points with skinning weights [M, J], [M, J - 1].
 
-        A point sees the joints that bound the bones which move it. No gradient reaches the weights this way: that the shape
-        could be mended by seeing other joints is no reason for a point to follow other bones.
+        A point depends on the joints at the ends of the bones that move it. No gradient reaches the weights this way: a better
+        shape under other joints is no reason for a point to follow other bones.
 
         Source: after SCANimate (Saito et al., CVPR 2021), which masks the pose by skinning weights.
         """
@@ -183,7 +183,7 @@ class System(nn.Module):
 
         Args:
             points: [M, 3], canonical frame, metres.
-            owner: the bone that each moves with, [M].
+            owner: [M], the bone that each point moves with.
             bone_transforms: [B, J, 4, 4], canonical to posed.
             pose: [B, J, 3].
             precision: of the network.
@@ -193,7 +193,7 @@ class System(nn.Module):
         return self.canonical_logits(points, self.condition(pose), index, precision)
 
     def joint_weights(self, joints: Tensor, bone_transforms: Tensor, pose: Tensor) -> Tensor | None:
-        """Return the skinning weights at the joints, [..., J, J], for the loss on them (SNARF Sec. 3.3); None: not trained.
+        """Return the skinning weights at the joints, [..., J, J], for their loss (SNARF Sec. 3.3); None if not trained.
 
         Args:
             joints: [J, 3], canonical frame, metres.
@@ -205,21 +205,21 @@ class System(nn.Module):
     def extra_losses(
         self, bone_transforms: Tensor, pose: Tensor, generator: torch.Generator, precision: str = "highest"
     ) -> dict[str, Tensor]:
-        """Return losses of the system's own, weighted, by name."""
+        """Return the losses that only this system has, weighted, by name."""
         return {}
 
     def far_points(self, count: int, bone_transforms: Tensor, generator: torch.Generator) -> Tensor | None:
-        """Return posed points [B, count, 3] at which the field may be occupied, samples or not; None: nowhere in particular."""
+        """Return posed points [B, count, 3] where the field may be occupied, also away from samples; None if not known."""
         return None
 
     def refresh_cells(self, pose: Tensor, precision: str = "highest") -> None:
-        """Look again, every now and then in training, where the shape is in poses [P, J, 3]."""
+        """Recompute the active cells from the current shape in poses [P, J, 3]; called periodically in training."""
 
     def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
-        """Look for the last time where the shape is in poses [P, J, 3]."""
+        """Shrink the active cells to the final shape in poses [P, J, 3]."""
 
     def freeze(self) -> None:
-        """Prepare for use after training: evaluate once what does not depend on the pose."""
+        """Prepare for use after training: compute what does not depend on the pose."""
         self.eval()
 
     # ---------------------------------------------------------------- use
@@ -230,19 +230,21 @@ class System(nn.Module):
 
     @property
     def search(self) -> SearchConfig | None:
-        """How correspondences are found; None in a system without a search."""
+        """Settings of the correspondence search; None in a system without one."""
         return None
 
     def choose_search(self, search: SearchConfig) -> None:
-        """Find correspondences in another way from now on.
+        """Change the settings of the correspondence search.
 
         Raises:
             ValueError: the system has no search, or cannot use this one.
         """
-        raise ValueError(f"model {self.config.model.name} searches no correspondences, got search.name {search.name!r}")
+        raise ValueError(
+            f"search: wanted none, since model {self.config.model.name} searches no correspondences, got {search.name}"
+        )
 
     def is_searched(self, canonical: Tensor) -> Tensor:
-        """Return at which canonical points [N, 3] the shape was trained, bool [N]."""
+        """Return whether the shape was trained at canonical points [N, 3], [N], bool."""
         return ((canonical >= self.grid.lower) & (canonical <= self.grid.upper)).all(1)
 
     def skinning_weights(self, canonical: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Results of a search of a given length, whatever the number of roots."""
+"""Results of a search with a fixed length, independent of the number of roots."""
 
 from __future__ import annotations
 

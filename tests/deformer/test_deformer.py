@@ -115,7 +115,7 @@ def test_moves_to_another_dtype(name):
 
 
 def stripes(x):
-    """A weight field that somebody wrote as a function."""
+    """A custom weight field, written as a function."""
     first = (3 * x[:, 0]).sigmoid()
     return torch.stack([first, 0.5 * (1 - first), 0.5 * (1 - first)], 1)
 
@@ -240,7 +240,7 @@ def test_the_name_of_a_search_stands_for_its_settings():
     assert module.search == SearchConfig("broyden")
 
 
-def test_what_does_not_go_together_is_refused():
+def test_what_does_not_go_together_is_rejected():
     grid = unit_grid(torch.float32)
     with pytest.raises(ValueError, match=r"skinning.name: wanted distilled, voxel, mlp or preset, got 'grid'"):
         ForwardDeformer(grid, BONES, settings("grid"))

@@ -57,7 +57,7 @@ def test_between_and_beyond_they_are_means_of_their_neighbours():
     far = (nodes[..., 1:].norm(dim=-1) - 0.3).abs() > 0.25
     assert bool(free[far].all())
     assert int(far.sum()) > 1000
-    assert float(values.max()) <= float(weights.max()) + 2e-2  # no extremes of their own
+    assert float(values.max()) <= float(weights.max()) + 2e-2  # no new extremes
 
 
 def test_equal_weights_stay_equal():
@@ -95,6 +95,6 @@ def test_preset_weights_are_kept_in_the_state_and_not_trained():
         (lambda v, w: (v + 1, w), "vertices: wanted all in the canonical box .* of 50 outside"),
     ],
 )
-def test_what_cannot_be_used_is_refused(change, message):
+def test_what_cannot_be_used_is_rejected(change, message):
     with pytest.raises(ValueError, match=message):
         diffuse_weights(*change(*tube(50)), unit_grid(), (4, 4, 4))

@@ -114,7 +114,7 @@ def test_chunks_change_nothing(scene):
 
 
 def test_gradcheck():
-    """To the points, the transforms and the field's parameters, by differences of the whole search."""
+    """To points, transforms and parameters of the field, by differences of the whole search along random directions."""
     field, transforms = DistanceField(), random_transforms(2, BONES, 0.15)
     points = 0.6 * torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 0.3
 
@@ -129,7 +129,7 @@ def test_gradcheck():
 
     inputs = points, transforms[:, :, :3].clone(), field.centres.detach().clone()
     assert roots(*inputs).shape == (6, 3)
-    assert torch.autograd.gradcheck(roots, tuple(x.requires_grad_() for x in inputs), eps=1e-6, atol=1e-5)
+    assert torch.autograd.gradcheck(roots, tuple(x.requires_grad_() for x in inputs), eps=1e-6, atol=1e-5, fast_mode=True)
 
 
 def test_gradient_of_a_network_equals_differences(scene):
@@ -162,7 +162,7 @@ def test_approximate_jacobian_is_near_but_not_equal(scene):
     assert 1e-6 < error < 0.3
 
 
-def test_second_derivative_is_refused(scene):
+def test_second_derivative_is_rejected(scene):
     field, transforms, points = scene
     points = points.clone().requires_grad_()
     found = find(points, transforms, field)
@@ -189,7 +189,7 @@ def test_works_wherever_autograd_is_off_and_under_autocast(scene):
 
 
 def test_rigid_fields_have_one_root_each():
-    """One bone everywhere: the root is B^-1 x', whatever other bones start the search; weights may be constants."""
+    """One bone everywhere: the root is B^-1 x', for all start bones; weights may be constants."""
     transforms = random_transforms(1, BONES, 1.0)
     points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     only = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)

@@ -40,7 +40,7 @@ def test_gradcheck(scene, search):
     assert torch.autograd.gradcheck(roots, (points, upper, scores), eps=1e-6, atol=1e-5)
 
 
-def test_second_derivative_is_refused(scene):
+def test_second_derivative_is_rejected(scene):
     points, transforms, scores = scene
     points = points.clone().requires_grad_()
     result = find_correspondences(points, transforms, scores.softmax(-1), unit_grid())

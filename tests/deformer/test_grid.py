@@ -62,7 +62,7 @@ def test_forward_map_and_its_jacobian_against_autograd():
     torch.testing.assert_close(jacobian, torch.stack([wanted[n, :, n] for n in range(5)]))
 
 
-def test_a_box_turned_inside_out_is_refused():
+def test_a_box_turned_inside_out_is_rejected():
     with pytest.raises(ValueError, match=r"grid\.upper: wanted more than grid\.lower"):
         CanonicalGrid(torch.zeros(3), torch.tensor([1.0, 0.0, 1.0]))
     with pytest.raises(ValueError, match=r"grid\.lower: wanted shape \[3\], got \[2\]"):

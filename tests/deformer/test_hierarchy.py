@@ -112,7 +112,7 @@ def test_branches_compete_only_where_they_part():
         ([-1, 5], "wanted numbers below 2, got 5"),
     ],
 )
-def test_what_is_no_tree_is_refused(parents, message):
+def test_what_is_no_tree_is_rejected(parents, message):
     with pytest.raises(ValueError, match=message):
         HierarchicalSoftmax(parents)
 

@@ -200,7 +200,7 @@ torch.save((name().decode(), found.query, found.canonical), sys.argv[1])
 
 @pytest.mark.parametrize("name", ["baseline", "avx2"])
 def test_lower_instruction_sets_find_the_same(name, tmp_path):
-    """Each is asked for by name in a process of its own; without fused multiplications roots differ in the last bits."""
+    """Each is chosen by name in a separate process; without fused multiplications roots differ in the last bits."""
     here = os.path.dirname(__file__)
     program = _SAVE.format(paths=[here, os.path.dirname(here)])
     subprocess.run(

@@ -171,7 +171,7 @@ def test_compiles_without_a_graph_break(search, capacity):
         found = find_correspondences(points, transforms, weights, grid, search=search, capacity=capacity)
         return found.maximum(found.canonical.square().sum(1), 0.0).sum()
 
-    # With a capacity the shapes are known; without, PyTorch must be told to trace a size that depends on the data.
+    # With a capacity the shapes are known; without, PyTorch traces a size that depends on the data only with this option.
     with torch._dynamo.config.patch(capture_dynamic_output_shape_ops=capacity is None):
         compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
         value = compiled(points, transforms, weights)

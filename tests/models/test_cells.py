@@ -153,7 +153,7 @@ def test_nothing_changes_where_all_is_to_be_searched_or_nothing_is_there(act):
 
 
 def test_samples_lie_close_enough():
-    """No cell is judged by samples farther apart than a thin part of a body, whatever the resolution."""
+    """At any resolution, samples of a cell are closer together than a thin part of a body."""
     assert fast_snarf._SAMPLES_M <= 0.04
     for resolution in ([6, 5, 4], [40, 30, 20]):
         avatar = capsule_avatar(resolution=resolution)

@@ -97,7 +97,7 @@ def bad_files(folder):
     damaged = "truncated or is not a file of snarf"
     return {
         "missing": "no avatar at", "empty": damaged, "text": damaged, "cut": damaged, "bomb": damaged, "raw": damaged,
-        "hollow": "does not describe an avatar of this version", "newer": "format version 99, this snarf reads 1",
+        "hollow": "does not describe an avatar of this version", "newer": "wanted format version 1, got 99",
         "list": "is not a snarf avatar", "other": "is not a snarf avatar",
     }  # fmt: skip
 

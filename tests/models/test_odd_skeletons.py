@@ -83,5 +83,5 @@ def test_an_empty_list_of_start_bones_follows_the_skeleton():
     assert with_start_bones(empty, other).init_bones is None
     given = SearchConfig(name="broyden", init_bones=[0, 3])
     assert with_start_bones(given, other) is given
-    with pytest.raises(UserError, match=r"search.init_bones must lie in 0..3, got \[4\]; null starts from all bones"):
+    with pytest.raises(UserError, match=r"search.init_bones: wanted bones from 0 to 3, got \[4\]; null starts from all bones"):
         with_start_bones(SearchConfig(name="broyden", init_bones=[4]), other)

@@ -224,7 +224,7 @@ def test_local_condition_needs_skinning_weights(store, name):
 
 
 def test_the_condition_may_say_where_it_enters(store):
-    """Whatever the shape says of it, which stays the default."""
+    """They replace the settings of the shape, which stay the default."""
     config = avatar_config()
     grid = CanonicalGrid(torch.full((3,), -1.0), torch.full((3,), 1.0))
     for condition, layer, size in ((ConditionConfig("local"), 2, 4), (ConditionConfig("local", 1, 7), 1, 7)):
@@ -288,7 +288,7 @@ SPOILT_TEMPLATES = {
 
 
 @pytest.mark.parametrize("problem", SPOILT_TEMPLATES)
-def test_a_spoilt_template_in_a_file_is_refused(store, problem):
+def test_a_spoilt_template_in_a_file_is_rejected(store, problem):
     content = new_system(store, "smpl_nn").to_dict()
     content["template"] = {"vertices": torch.zeros(4, 3), "weights": torch.ones(4, 2)}
     Avatar.from_dict(content)
@@ -307,11 +307,11 @@ def test_gradients_reach_the_pose_through_the_base_mesh(store):
     assert float(transforms.grad.abs().max()) > 0
 
 
-def test_what_a_system_lacks_is_refused(store):
+def test_what_a_system_lacks_is_rejected(store):
     avatar = new_system(store, "nasa")
     with pytest.raises(ValueError, match="model nasa has no canonical shape"):
         avatar.mesh(POSES[0], resolution=16, surface="skinned")
-    with pytest.raises(ValueError, match=r"model nasa searches no correspondences, got search.name 'broyden'"):
+    with pytest.raises(ValueError, match="search: wanted none, since model nasa searches no correspondences, got broyden"):
         avatar.model.choose_search(SearchConfig("broyden"))
     with pytest.raises(ValueError, match="model back_d has no skinning weights"):
         new_system(store, "back_d").skinning_weights(torch.zeros(1, 3))

@@ -11,7 +11,15 @@ from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
 from ground_truth import true_roots
 from skinning_scenes import posed_queries, random_transforms, smooth_weights, unit_grid
 
-from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences, ops
+from snarfcli.deformer import (
+    CanonicalGrid,
+    ForwardDeformer,
+    SearchConfig,
+    SkinningConfig,
+    cells_near,
+    find_correspondences,
+    ops,
+)
 from snarfcli.deformer.correspondences import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.native import cpu, cuda, cuda_compile, cuda_driver
@@ -386,7 +394,7 @@ def test_strides_and_addresses_do_not_matter(runner):
     assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
 
 
-def test_too_many_queries_are_refused():
+def test_too_many_queries_are_rejected():
     points = torch.empty(1, 1, 3).expand(2**16, 2**15, 3)
     with pytest.raises(ValueError, match="points: wanted fewer than 2"):
         cuda._check_limits(points.shape[0] * points.shape[1], 1)
@@ -446,6 +454,30 @@ def test_a_search_with_a_capacity_fits_into_a_cuda_graph():
 
 
 @needs_gpu
+@pytest.mark.parametrize("search", ["complete", SearchConfig("broyden", [0, 2])])
+def test_a_deformer_with_a_capacity_fits_into_a_cuda_graph(search):
+    """Nothing in the call waits for the device: PyTorch would raise."""
+    grid = unit_grid(torch.float32)
+    skinning = SkinningConfig(resolution=[8, 7, 6], width=16, depth=2)
+    module = ForwardDeformer(grid, 3, skinning, search, cells_near(grid, SHAPE, [(torch.zeros(1, 2, 3), 0.8)])).cuda()
+    transforms = random_transforms(2, 3, 0.3, dtype=torch.float32).cuda()
+    points = torch.rand(2, 50, 3, generator=torch.Generator().manual_seed(0)).cuda()
+    with torch.no_grad():
+        wanted = module(points, transforms, capacity=300)
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            module(points, transforms, capacity=300)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            found = module(points, transforms, capacity=300)
+    graph.replay()
+    assert torch.equal(found.canonical, wanted.canonical)
+    assert int(found.total) > 50
+
+
+@needs_gpu
 def test_the_current_stream_and_device_are_used():
     points, _, _, grid, transforms = scene(24, 0.5, torch.float32)
     for index in range(torch.cuda.device_count()):
@@ -469,7 +501,7 @@ def test_correspondences_and_their_gradients_are_those_of_the_cpu(search):
         found = find_correspondences(
             *given, grid.to(given[0]), search=SearchConfig(search, backend="native", tolerance=1e-9, max_steps=30)
         )
-        (found.canonical**2).sum().backward()  # on a thread of its own, which has no CUDA context yet
+        (found.canonical**2).sum().backward()  # on another thread, which has no CUDA context yet
         results.append([found.query.cpu(), found.canonical.detach().cpu(), *(value.grad.cpu() for value in given)])
     assert torch.equal(results[0][0], results[1][0])
     for mine, theirs in zip(results[1][1:], results[0][1:], strict=True):

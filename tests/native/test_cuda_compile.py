@@ -67,7 +67,7 @@ def test_compiled_kernels_are_kept_and_damaged_ones_compiled_again(tmp_path, mon
     for damage in (b"", file.read_bytes()[:-1], file.read_bytes()[:100] + b"?" + file.read_bytes()[101:]):
         file.write_bytes(damage)
         assert len(cuda_compile.load_kernels(*wanted)) == len(code)
-        assert cuda_compile._read(file) is not None  # mended
+        assert cuda_compile._read(file) is not None  # replaced
     assert len(compiled) == 3
     cuda_compile.load_kernels("gather", torch.float64, "sm_80")
     cuda_compile.load_kernels("gather", torch.float32, "sm_90")

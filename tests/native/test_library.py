@@ -1,4 +1,4 @@
-"""Loading of the native library: that it is loaded here, and that whatever is wrong with it is a reason, not a crash."""
+"""Loading of the native library: it is loaded here, and any problem with it is reported as a reason, not a crash."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def no_library(fresh, tmp_path):
 
 
 def test_the_native_library_is_loaded_here():
-    """Otherwise every other test would pass on the reference, and nobody would know."""
+    """Otherwise every other test would pass on the reference, unnoticed."""
     assert library.native_library() is not None, library.why_unavailable()
     assert library.why_unavailable() is None
     assert library.library_path().is_file()
@@ -113,7 +113,7 @@ def test_a_wrong_variable_is_named(fresh):
 
 @pytest.mark.parametrize("size", [0, 63, 64, 200, 5_000, 50_000])
 def test_a_library_that_ends_too_early_is_a_reason(fresh, tmp_path, size):
-    """Loading one would end the process with a bus error. A whole library is larger, whatever it was built with."""
+    """Loading one would end the process with a bus error. A whole library is larger, with any compiler."""
     content = library.library_path().read_bytes()
     library._load.cache_clear()
     (tmp_path / "short.so").write_bytes(content[:size])
@@ -128,7 +128,7 @@ def test_a_file_that_is_no_library_is_a_reason(fresh, tmp_path):
     assert library.why_unavailable().startswith("the native library cannot be loaded: ")
 
 
-def test_a_library_of_somebody_else_is_a_reason(fresh):
+def test_another_library_is_a_reason(fresh):
     import numpy.fft._pocketfft_umath as other
 
     fresh.setenv("SNARF_NATIVE_LIBRARY", other.__file__)

@@ -76,7 +76,7 @@ typedef struct snarf_layer {
 typedef struct snarf_network {
   const snarf_layer* layers;
   int32_t layer_count;
-  const float* frequencies; /* radians a metre, [K]: the encoded point is x, sin(k x) for each k, cos(k x) for each k */
+  const float* frequencies; /* radians per metre, [K]: the encoded point is x, sin(k x) for each k, cos(k x) for each k */
   int32_t frequency_count;
   const float* segments; /* bones, [S, 2, 3], metres */
   int32_t segment_count; /* S; 0 for no capsules */

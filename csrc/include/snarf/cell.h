@@ -1,4 +1,4 @@
-// One grid cell as a polynomial: where it goes, how curved it is, and its eight parts.
+// One grid cell as a polynomial: its posed image, its curvature, and its eight parts.
 //
 // DESIGN. Inside a cell the blended transform T is trilinear (Fast-SNARF Sec. 4.1) and d(x) = T(x) [x; 1] (SNARF Eq. 4), so
 // each component of d is a polynomial in the cell's coordinates s = (s0, s1, s2), which run from -1/2 to 1/2: the eight
@@ -115,7 +115,7 @@ SNARF_HD void bound_cell(const Cell<V>& cell, CellBounds<V>& out, S wide = S(0.5
   }
   V determinant = adjugate(jacobian, adj);
   V zero = determinant * S(0);
-  // A Jacobian that is singular up to rounding says nothing about where roots are.
+  // A Jacobian that is singular up to rounding gives no bound on roots.
   V scale = zero + epsilon;
   for (int axis = 0; axis < 3; ++axis) scale = scale * longest_of(jacobian[axis], jacobian[3 + axis], jacobian[6 + axis]);
   auto regular = absolute(determinant) > scale;

@@ -1,4 +1,4 @@
-// The canonical grid: where its nodes are, and the blended transform at a point.
+// The canonical grid: the positions of its nodes, and the blended transform at a point.
 #pragma once
 
 #include "platform.h"

@@ -1,5 +1,5 @@
-// What the shared mathematics needs of the compiler: host and device markers, and the few operations that a scalar and a pack
-// of SIMD lanes have in common. Included by the CPU kernels (GCC, Clang, MSVC) and by the CUDA kernels (NVRTC): no standard
+// Compiler support for the shared mathematics: host and device markers, and the few operations that a scalar and a pack of
+// SIMD lanes have in common. Included by the CPU kernels (GCC, Clang, MSVC) and by the CUDA kernels (NVRTC): no standard
 // headers.
 //
 // Everything is templated on V, the type of a number: float or double, or a pack of them (csrc/cpu/lanes.h). A comparison of V

@@ -246,7 +246,7 @@ def test_a_broken_sequence_stops_the_run_or_is_left_out(
     with pytest.raises(UserError, match=r"mesh 000031.obj is damaged; give skip_broken=true"):
         preprocess.run(_config(tmp_path, sequences=["wave", "bend"]))
     assert {name.split("/")[1] for name in _contents(tmp_path) if "/" in name} == {"wave"}  # what was complete stays
-    preprocess.run(_config(tmp_path, skip_broken=True, workers=2))
+    preprocess.run(_config(tmp_path, skip_broken=True))
     store = SampleStore.open(tmp_path, "builtin", "toy")
     assert [(entry["split"], entry["name"]) for entry in store.manifest["sequences"]] == [("test", "wave"), ("ood", "fold")]
     assert store.manifest["skipped"] == [

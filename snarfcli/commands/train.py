@@ -188,7 +188,7 @@ def _check(config: TrainConfig) -> None:
         check_number(f"model.{name}", getattr(config.model, name), least)
     if config.model.name == "snarf" and config.search.name != "broyden":
         raise UserError(
-            "search: wanted snarf or broyden with model=snarf, got {config.search.name}; give one of them, or leave search out"
+            f"search: wanted snarf or broyden with model=snarf, got {config.search.name}; give one of them, or leave search out"
         )
     check_skinning(config.skinning, config.search)
     if config.model.name != "fast_snarf" and config.skinning.name in ("voxel", "preset"):

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from failing_meshes import FailingMeshes
 from toy_subject import toy_body, toy_subject
 
 from snarfcli.commands import preprocess
 from snarfcli.commands.preprocess import PreprocessConfig
-from snarfcli.datasets.posed_meshes import FileMeshes, PosedMeshes
+from snarfcli.datasets.posed_meshes import FileMeshes
 from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.subjects import SubjectData
@@ -208,37 +209,11 @@ def test_a_folder_that_cannot_be_made_is_an_os_error(tmp_path: Path, subject: li
         preprocess.run(_config(tmp_path))
 
 
-class _FailsAt:
-    """Meshes of which one cannot be read, as when a file is damaged."""
-
-    def __init__(self, meshes: PosedMeshes, bad: int) -> None:
-        self.meshes, self.bad, self.frames = meshes, bad, np.arange(len(meshes))
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        if self.frames[index] == self.bad:
-            raise UserError(f"mesh {self.bad:06d}.obj is damaged")
-        return self.meshes[self.frames[index]]
-
-    def chosen(self, frames: np.ndarray) -> _FailsAt:
-        part = _FailsAt(self.meshes, self.bad)
-        part.frames = frames
-        return part
-
-    def source(self, index: int) -> str:
-        return ""
-
-    def fingerprint(self) -> str:
-        return ""
-
-
 def test_a_broken_sequence_stops_the_run_or_is_left_out(
     tmp_path: Path, subject: list[SubjectData], caplog: pytest.LogCaptureFixture
 ) -> None:
     train, wave, fold = subject[0].sequences
-    broken = replace(train, meshes=_FailsAt(train.meshes, 31))  # in the second task of the sequence
+    broken = replace(train, meshes=FailingMeshes(train.meshes, 31))  # in the second task of the sequence
     subject[0] = replace(subject[0], sequences=(wave, broken, fold), broken=(("lost", "lost.npz is truncated"),))
     with pytest.raises(UserError, match=r"sequence lost cannot be used: lost.npz is truncated; give skip_broken=true"):
         preprocess.run(_config(tmp_path))
@@ -246,7 +221,7 @@ def test_a_broken_sequence_stops_the_run_or_is_left_out(
     with pytest.raises(UserError, match=r"mesh 000031.obj is damaged; give skip_broken=true"):
         preprocess.run(_config(tmp_path, sequences=["wave", "bend"]))
     assert {name.split("/")[1] for name in _contents(tmp_path) if "/" in name} == {"wave"}  # what was complete stays
-    preprocess.run(_config(tmp_path, skip_broken=True))
+    preprocess.run(_config(tmp_path, skip_broken=True, workers=2))
     store = SampleStore.open(tmp_path, "builtin", "toy")
     assert [(entry["split"], entry["name"]) for entry in store.manifest["sequences"]] == [("test", "wave"), ("ood", "fold")]
     assert store.manifest["skipped"] == [

@@ -108,7 +108,7 @@ def test_systems_that_need_true_weights_reject_samples_without(config_for, name,
 
     monkeypatch.setattr(SampleStore, "open", without_template)
     config = config_for(name)
-    with pytest.raises(UserError, match=f"model={name} needs the subject's mesh with its true skinning weights"):
+    with pytest.raises(UserError, match=f"model={name} needs a mesh with ground-truth skinning weights"):
         run(config)
     assert not Path(config.output_root).exists()
 

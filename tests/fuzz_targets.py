@@ -91,7 +91,7 @@ def gltf() -> Target:
 
 
 def _with_broken_json(rng: random.Random, content: bytes) -> bytes:
-    """Change one to three values of a glTF file's JSON, and keep the container around it whole."""
+    """Change one to three values in the JSON of a glTF file; its container stays valid."""
     import json
     import struct
 

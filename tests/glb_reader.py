@@ -1,4 +1,4 @@
-"""Reads a character from a `.glb` file by pygltflib and plain numpy, straight after the specification, sharing no code with us.
+"""An independent reader of characters in `.glb` files: pygltflib and NumPy, written from the specification.
 
 Source: Khronos, glTF 2.0 specification, 3.6.2 (accessors), 3.7.2.2 (morph targets), 3.7.3 (skins), 3.11 (animations).
 """
@@ -35,7 +35,7 @@ def run_reader(script: str, *arguments: object) -> dict:
 
 
 class GlbReader:
-    """One file with one skinned mesh."""
+    """A file with one skinned mesh."""
 
     def __init__(self, path: Path) -> None:
         pygltflib = pytest.importorskip("pygltflib", reason="an independent reader of glTF")
@@ -72,7 +72,7 @@ class GlbReader:
         return self.array(self.primitive.indices).reshape(-1, 3)
 
     def dense_weights(self) -> np.ndarray:
-        """Return the weights [V, J], by joint of the skin."""
+        """Return the skinning weights [V, J] for the joints of the skin."""
         dense = np.zeros((len(self.attribute("POSITION")), len(self.skin.joints)))
         for number in range(2):
             if getattr(self.primitive.attributes, f"JOINTS_{number}", None) is not None:
@@ -81,7 +81,7 @@ class GlbReader:
         return dense
 
     def values(self, clip: str, time: float) -> dict[tuple[int, str], np.ndarray]:
-        """Return what the channels of a clip say at a time, by node and path."""
+        """Return the values of the channels of a clip at a time, by node and path."""
         animation, found = self.clips[clip], {}
         for channel in animation.channels:
             sampler = animation.samplers[channel.sampler]

@@ -20,7 +20,7 @@ BODY_NAMES = {
 
 
 def write_body(folder: Path, gender: str = "female") -> Path:
-    """Write the built-in body under a name that SMPL's files have."""
+    """Write the built-in body under the name of an SMPL file."""
     body = builtin_body()
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / BODY_NAMES[gender]
@@ -70,7 +70,7 @@ def write_new(path: Path, values: np.ndarray, **changes: object) -> None:
 
 
 def write_dfaust(root: Path, subject: str = "50002", release: str = "old", nested: str = "", dtype: type = np.float64) -> None:
-    """Write one DFaust subject and PosePrior as the archives unpack; `nested` are folders in between."""
+    """Write one DFaust subject and PosePrior as the archives unpack; `nested` names the folders in between."""
     split = papers_split()
     sequences = split["dfaust"][subject]
     base = root / nested

@@ -62,7 +62,7 @@ def _changed(rng: random.Random, content: bytes) -> bytes:
 
 
 def damaged_body(rng: random.Random, content: bytes) -> bytes:
-    """Return a damaged pickle or, half of the time, a sound pickle of a body whose arrays do not fit."""
+    """Return a damaged pickle or, half of the time, a valid pickle of a body with wrong arrays."""
     if rng.random() < 0.5:
         return damaged(rng, content)
     arrays = damaged_arrays(rng, octahedron())

@@ -1,4 +1,4 @@
-"""Arrays of made-up pose files, and a skeleton that is none of SMPL's."""
+"""Arrays of made-up pose files, and a skeleton other than SMPL's."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _WORDS = [
 
 
 def read_both(path: Path) -> object:
-    """Read a file as a skeleton, and as poses of one."""
+    """Read a file as a skeleton and as poses."""
     try:
         order = read_skeleton(path).order
     except UserError as error:

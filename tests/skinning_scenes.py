@@ -19,7 +19,7 @@ def smooth_weights(shape: tuple[int, int, int], bones: int, seed: int = 0, dtype
 
 
 def unit_grid(dtype=torch.float64) -> CanonicalGrid:
-    """Return a box of two metres a side, not quite centred."""
+    """Return a box with sides of two metres, not quite centred."""
     return CanonicalGrid(torch.tensor([-1.0, -0.9, -1.1], dtype=dtype), torch.tensor([1.0, 1.1, 0.9], dtype=dtype))
 
 
@@ -53,7 +53,7 @@ def move(canonical: Tensor, weights: Tensor, transforms: Tensor, grid: Canonical
 
 
 def posed_queries(weights: Tensor, transforms: Tensor, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Return queries [N, 3] that have a root under one pose [J, 4, 4], and the canonical points they were made from."""
+    """Return queries [N, 3] that have a root in one pose [J, 4, 4], and the canonical points they were made from."""
     grid = unit_grid(weights.dtype)
     generator = torch.Generator().manual_seed(seed)
     share = torch.rand(count, 3, generator=generator, dtype=torch.float64).to(weights.dtype)

@@ -95,7 +95,7 @@ def pickled(arrays: dict[str, Any], *, chumpy: tuple[str, ...] = ("shapedirs",),
     Args:
         arrays: by name.
         chumpy: the names of those that are chumpy objects.
-        selected: where positive, shapedirs is a selection among so many more components, as in MANO.
+        selected: where positive, shapedirs is a selection from this many further components, as in MANO.
     """
     with _chumpy_modules() as (value, selection):
         content = dict(arrays)
@@ -133,7 +133,7 @@ class _Python2Pickler(pickle._Pickler):
 
 @contextmanager
 def _chumpy_modules() -> Iterator[tuple[type, type]]:
-    """Make classes that pickle as chumpy's."""
+    """Make classes that are pickled like those of chumpy."""
     modules = {name: ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")}
     classes = type("Ch", (), {"__module__": "chumpy.ch"}), type("Select", (), {"__module__": "chumpy.reordering"})
     modules["chumpy.ch"].Ch, modules["chumpy.reordering"].Select = classes

@@ -1,4 +1,4 @@
-"""Checks of settings: what passes, and what the message says otherwise."""
+"""Checks of settings: which values pass, and the messages for others."""
 
 from __future__ import annotations
 

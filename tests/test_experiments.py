@@ -1,4 +1,4 @@
-"""Presets of whole experiments: `experiment=` on the command line, together with the choices that a user makes."""
+"""Presets of whole experiments: `experiment=` on the command line, together with other settings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NAMES = ("preprocess", "train", "eval", "animate", "export")
 
 
 def composed(capsys, *arguments):
-    """Return the configuration that a command would run with."""
+    """Return the configuration of a command."""
     code = cli.main([*arguments, "--cfg", "job"])
     out, err = capsys.readouterr()
     assert code == 0, err
@@ -34,7 +34,7 @@ def test_none_is_chosen_by_default(capsys):
 
 @pytest.mark.parametrize("training", ["quick", "paper"])
 @pytest.mark.parametrize("is_first", [True, False])
-def test_cape_changes_what_the_preset_of_training_says_whatever_comes_first(capsys, training, is_first):
+def test_cape_changes_what_the_preset_of_training_says_in_any_order(capsys, training, is_first):
     choices = ["experiment=cape", f"training={training}"]
     config = composed(capsys, "train", *(choices if is_first else choices[::-1]))
     without = composed(capsys, "train", f"training={training}")
@@ -43,7 +43,7 @@ def test_cape_changes_what_the_preset_of_training_says_whatever_comes_first(caps
     frequencies, others = config["shape"].pop("frequencies"), without["shape"].pop("frequencies")
     assert frequencies != others
     assert (config["condition"].pop("layer"), without["condition"].pop("layer")) == (0, None if training == "paper" else 2)
-    assert config == without  # width, depth, losses and steps are the preset's, the data the user's
+    assert config == without  # width, depth, losses and steps are those of the preset, the data is given
     ratios = [b / a for a, b in itertools.pairwise(frequencies)]
     assert len(ratios) > 2
     assert ratios == pytest.approx([2.0] * len(ratios), rel=1e-3)
@@ -61,11 +61,11 @@ def test_smoke_is_one_small_folder_for_every_command(capsys):
     configs = {name: composed(capsys, name, "experiment=smoke") for name in NAMES}
     assert {config["experiment"] for config in configs.values()} == {"smoke"}
     (root,) = {config["data_root"] for config in configs.values()}
-    assert root != composed(capsys, "train")["data_root"]  # full samples stay as they are
+    assert root != composed(capsys, "train")["data_root"]  # full samples are not changed
     assert len({config["output_root"] for name, config in configs.items() if name != "preprocess"}) == 1
     assert configs["train"]["training"]["name"] == "smoke"
     assert configs["train"]["shape"]["width"] == 128
-    # 240 frames a training sequence: some must be left for training beside those for validation.
+    # 240 frames per training sequence: some must remain for training beside those for validation.
     assert 2 <= 240 / configs["preprocess"]["data"]["frame_step"] <= 10
 
 
@@ -91,7 +91,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("arguments", WRONG, ids=" ".join)
-def test_unknown_ones_are_refused_in_one_line(capsys, arguments):
+def test_unknown_ones_are_rejected_in_one_line(capsys, arguments):
     assert cli.main(list(arguments)) == 2
     err = capsys.readouterr().err
     assert WRONG[arguments] in err

@@ -1,4 +1,4 @@
-"""Files: whole or not at all, and nothing in them is executed."""
+"""Files are written complete or not at all, and nothing in them is executed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["{", "[" * 100_000, "1" * 5000, "\xff", "", " " * (2**25 + 1)])
-def test_what_is_no_json_is_refused(tmp_path: Path, text: str) -> None:
+def test_what_is_no_json_is_rejected(tmp_path: Path, text: str) -> None:
     path = tmp_path / "split.json"
     path.write_bytes(text.encode("latin1"))
     with pytest.raises(UserError, match=r"^split .*split.json ") as caught:

@@ -1,4 +1,4 @@
-"""A rigged animal from its file to a moving avatar, by the commands that a user types."""
+"""A rigged animal from its file to an animated avatar, with the commands of a user."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work on several processes: order, errors, and that nothing is left running."""
+"""Work in several processes: order, errors, and that no process is left running."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _answer(factor: int, requests: Iterator[int]) -> Iterator[int]:
 
 
 def _deaf() -> Iterator[bytes]:
-    """Ignores the signal that should end it, as happens where Python ignores exceptions, and fills the pipe."""
+    """Ignore the signal to end, as happens where Python ignores exceptions, and fill the pipe."""
     signal.signal(signal.SIGTERM, lambda *_: None)
     while True:
         yield bytes(1 << 20)

@@ -18,7 +18,7 @@ __all__ = ["ANIMAL_CLIPS", "HELD_OUT_CLIP", "Animal", "AnimalMotion", "animal_mo
 FRAME_RATE = 30.0
 ANIMAL_CLIPS = ("walk", "trot", "sniff", "sit")
 HELD_OUT_CLIP = "sit"
-"""Unlike the others, for tests of poses never seen."""
+"""A motion unlike the others, for tests of unseen poses."""
 
 # name: parent, place at rest (metres), end of the capsule relative to it, radii at both ends (metres); left is +x.
 _BODY = {

@@ -1,4 +1,4 @@
-"""Writes the toy animal as a rigged GLB, as a folder of posed meshes with its skeleton and poses, and as BVH."""
+"""Write the toy animal as a rigged GLB, as a folder of posed meshes with its skeleton and poses, and as BVH."""
 
 from __future__ import annotations
 

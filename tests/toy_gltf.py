@@ -1,4 +1,4 @@
-"""Writes glTF files byte by byte, for tests; shares no code with the reader."""
+"""Write glTF files byte by byte, for tests; no code is shared with the reader."""
 
 from __future__ import annotations
 
@@ -49,6 +49,6 @@ class GltfBuilder:
         return struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks
 
     def gltf(self, uri: str | None = None) -> bytes:
-        """Return a text file whose buffer is at `uri`, in the file itself by default."""
+        """Return a text file whose buffer is at `uri`, by default in the file itself."""
         uri = uri or "data:application/octet-stream;base64," + base64.b64encode(self.binary).decode()
         return json.dumps({**self.root, "buffers": [{"byteLength": len(self.binary), "uri": uri}]}).encode()

@@ -57,7 +57,7 @@ def toy_body() -> Body:
     vertices, faces = capsule_mesh(2 * LENGTH, RADIUS, around=12, along=12, cap=3)
     second = 1 / (1 + np.exp(-(vertices[:, 0] - LENGTH) / 0.05))
     joints = np.array([[0.0, 0, 0], [LENGTH, 0, 0]])
-    # the regressor must reproduce the joints from the vertices: rings are symmetric, so weigh first and last vertex
+    # the regressor must reproduce the joints from the vertices: rings are symmetric, so weight first and last vertex
     ends = vertices[[0, -1], 0]
     regressor = np.zeros((2, len(vertices)))
     regressor[:, -1] = (joints[:, 0] - ends[0]) / (ends[1] - ends[0])

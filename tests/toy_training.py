@@ -26,7 +26,7 @@ def toy_store(root: Path, points: int = 800, frames: int = 34) -> SampleStore:
 
 
 def avatar_config(*, capsules: bool = False, condition: str = "global", **search: object) -> AvatarConfig:
-    """Return networks of a size that trains in seconds; with `capsules` the shape starts as one around the only bone."""
+    """Return networks that train in seconds; with `capsules` the initial shape is a capsule around the only bone."""
     skinning = SkinningConfig(
         resolution=[16, 12, 8], margin_m=[0.05, 0.05, 0.05], width=32, depth=2, weight_norm=False, prior_falloff_m=0.03
     )

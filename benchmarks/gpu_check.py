@@ -32,7 +32,7 @@ from torch import Tensor
 from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences
 from snarfcli.deformer.correspondences import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
-from snarfcli.native import cuda, cuda_compile, cuda_driver
+from snarfcli.native import cuda, cuda_compile, cuda_driver, cuda_launches
 
 ROOT = Path(__file__).resolve().parents[1]
 TEST = "tests/native/test_cuda.py"
@@ -327,12 +327,12 @@ def bandwidth(report: Report, chosen: list[Case], repeats: int) -> None:
     for case in chosen:
         gpu = TimedGpu(cuda_driver.gpu(case.points))
         for _ in range(repeats + 1):
-            cuda.run_complete(gpu, case.points, case.transforms, *case.box, case.active, TOLERANCE, STEPS, False, None)
+            cuda_launches.run_complete(gpu, case.points, case.transforms, *case.box, case.active, TOLERANCE, STEPS, False, None)
         found = case.complete()
         gradient = torch.randn(len(found[1]), 3, device=case.points.device)
         for _ in range(repeats + 1):
             sizes = case.points.shape[:2]
-            cuda.run_backward(gpu, gradient, *found[:3], *case.box, *sizes, True, True)
+            cuda_launches.run_backward(gpu, gradient, *found[:3], *case.box, *sizes, True, True)
         queries, roots, poses = case.points.shape[0] * case.points.shape[1], len(found[1]), len(case.bones)
         nodes = case.transforms.shape[1] * poses * TRANSFORM_BYTES
         records, bins = case.cells * RECORD_BYTES, 4 * poses * min(max(case.points.shape[1], 64), 1 << 20)

@@ -1,20 +1,26 @@
-// The order of work of a complete search.
+// The complete search, phase by phase on all threads.
 //
-// DESIGN. A group of poses runs through these phases, each on all threads:
-//   boxes    posed boxes of all active cells, and the region that holds the queries
-//   mark     bins of a uniform posed-space grid that a box touches; queries in other bins have no root and go no further
-//   count    queries in each marked bin, chunk by chunk
-//   place    counting sort of the queries into the bins
-//   search   blocks of cells, handed out one by one; every thread keeps its own list of roots
-// and through those of `Collect`, which sorts the roots by query, and within a query by cell, and drops duplicates on the
-// common face of two cells. The result does not depend on which thread found a root, and the roots of a query do not depend on
-// the other queries of the batch.
+// DESIGN. A group of poses goes through these phases. Most are shared by all threads; all threads finish a phase before the
+// next.
+//   measure       the posed boxes of all active cells, and the region that contains the queries
+//   lay_out_bins  (one thread) the uniform grid of bins in posed space, for each pose
+//   mark          the bins that a box touches; queries in other bins have no root and are dropped
+//   count         the number of queries in each marked bin, chunk by chunk
+//   scan          the first position of each bin among the sorted queries
+//   place         the queries, sorted into the bins (a counting sort)
+//   search        the roots in each block of cells; each thread takes a few blocks at a time and has its own list of roots
+// The phases of `Collect` follow: they sort the roots by query, and within a query by cell, and drop duplicates on the common
+// face of two cells. The result does not depend on which thread found a root, and the roots of a query do not depend on the
+// other queries of the batch.
 #pragma once
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
+#include <functional>
 #include <limits>
 #include <memory>
+#include <new>
 #include <vector>
 
 #include "bins.h"
@@ -26,11 +32,12 @@
 
 namespace snarf {
 
-constexpr int64_t kGroupQueries = int64_t(1) << 20;  // queries searched together: bounds the memory of the sort
-constexpr int64_t kGroupBlocks = int64_t(1) << 17;   // blocks of cells of all poses searched together: 50 MB of boxes
-constexpr int64_t kMostChunks = 8;                   // parts of a pose's queries that are sorted at once; each has a histogram
-constexpr double kBinPerBox = 0.6;                   // side of a bin, in mean sides of the posed boxes
+constexpr int64_t kGroupQueries = int64_t(1) << 20;  // maximum number of queries in a group; limits the memory of the sort
+constexpr int64_t kGroupBlocks = int64_t(1) << 17;   // maximum of poses x blocks in a group: 50 MB of boxes in float32
+constexpr int64_t kMaxChunks = 8;                    // maximum number of chunks of a pose's queries; each has its own histogram
+constexpr double kBinPerBox = 0.6;                   // side of a bin, as a share of the mean side of the posed boxes
 
+// Owns the memory of a `Scratch`, and enlarges it on demand.
 template <class S>
 class ScratchLists {
  public:
@@ -69,6 +76,7 @@ Geometry<S> geometry_of(const snarf_field& field) {
 
 inline int64_t node_count(const snarf_field& field) { return int64_t(field.nodes[0]) * field.nodes[1] * field.nodes[2]; }
 
+// The blocks with at least one cell to search. `active`: [(D-1)(H-1)(W-1)], or null for all cells.
 inline std::vector<Block> active_blocks(const snarf_field& field, const uint8_t* active) {
   const int cells[3] = {field.nodes[0] - 1, field.nodes[1] - 1, field.nodes[2] - 1};
   std::vector<Block> blocks;
@@ -88,12 +96,12 @@ S smallest_side(const Geometry<S>& geometry) {
   return std::min(geometry.size[0], std::min(geometry.size[1], geometry.size[2]));
 }
 
-// A box, and how large the boxes in it are; one for each pose and thread, or part of its queries.
+// The smallest box, in posed space, around several posed boxes or several points, metres.
 template <class S>
 struct Extent {
   S lower[3], upper[3];
-  double sides = 0;
-  int64_t boxes = 0;
+  double sides = 0;   // sum, over the boxes, of the mean of a box's three sides
+  int64_t boxes = 0;  // number of boxes; 0 for points
   Extent() {
     std::fill(lower, lower + 3, std::numeric_limits<S>::infinity());
     std::fill(upper, upper + 3, -std::numeric_limits<S>::infinity());
@@ -108,7 +116,9 @@ struct Extent {
   }
 };
 
-// The complete search of a group: `poses` poses from `first_pose` on, and of each the queries from `first_query` on.
+// The complete search of a group: `poses` poses from `first_pose` on, and `count` queries of each from `first_query` on.
+//
+// Each of a pose's `chunks_` chunks of queries is a part: part = pose * chunks_ + chunk.
 template <class S>
 class CompleteSearch {
  public:
@@ -120,7 +130,7 @@ class CompleteSearch {
         poses_(poses),
         count_(count),
         threads_(threads),
-        chunks_(int(std::min<int64_t>((threads + poses - 1) / poses, kMostChunks))),
+        chunks_(int(std::min<int64_t>((threads + poses - 1) / poses, kMaxChunks))),
         geometry_(geometry_of<S>(field)),
         nodes_(node_count(field)),
         points_(static_cast<const S*>(queries.points) + 3 * (first_pose * queries.count + first_query)),
@@ -135,7 +145,7 @@ class CompleteSearch {
         place_queue_(poses * chunks_, 1),
         search_queue_(poses * int64_t(blocks.size()), 4) {}
 
-  // Adds its phases; the roots go to `group`.
+  // Appends the phases of the search to `phases`. They write the roots to `group`. Both objects must outlive them.
   void add_to(std::vector<std::function<void(int)>>& phases, Group<S>& group) {
     phases.push_back([this, &group](int thread) {
       if (thread) return;
@@ -189,20 +199,20 @@ class CompleteSearch {
     }
   }
 
-  // The queries of a pose are cut into `chunks_` chunks; this one's first query, or that of the next.
+  // The first query of a part, or with next = 1 the end of the part, counted within its pose.
   int64_t chunk_begin(int64_t part, int next = 0) const { return count_ * (part % chunks_ + next) / chunks_; }
 
   void lay_out_bins() {
     for (int64_t pose = 0; pose < poses_; ++pose) {
-      Extent<S> cells, here;
+      Extent<S> cells, points;
       for (int t = 0; t < threads_; ++t) cells.include(box_extents_[t * poses_ + pose]);
-      for (int c = 0; c < chunks_; ++c) here.include(query_extents_[pose * chunks_ + c]);
+      for (int c = 0; c < chunks_; ++c) points.include(query_extents_[pose * chunks_ + c]);
       SortedQueries<S>& sorted = sorted_[pose];
       double volume = 1;
       bool empty = cells.boxes == 0;
       for (int i = 0; i < 3; ++i) {
-        sorted.lower[i] = std::max(cells.lower[i], here.lower[i]);
-        sorted.upper[i] = std::min(cells.upper[i], here.upper[i]);
+        sorted.lower[i] = std::max(cells.lower[i], points.lower[i]);
+        sorted.upper[i] = std::min(cells.upper[i], points.upper[i]);
         empty |= !(sorted.lower[i] <= sorted.upper[i]);
       }
       double side = 1;
@@ -210,8 +220,8 @@ class CompleteSearch {
         side = kBinPerBox * cells.sides / double(cells.boxes);
         double longest = 0;
         for (int i = 0; i < 3; ++i) longest = std::max(longest, double(sorted.upper[i] - sorted.lower[i]));
-        // Not many more bins than queries, since each costs as much as a query.
-        side = std::max(side, longest * 1e-3);
+        // At most 4096 more bins than queries, since a bin costs as much time as a query.
+        side = std::max(side, longest * 1e-3);  // at most about 1000 bins along an axis
         for (;; side *= 1.25) {
           volume = 1;
           for (int i = 0; i < 3; ++i)
@@ -294,7 +304,7 @@ class CompleteSearch {
       sorted.query = query_.get() + pose * count_;
       for (int i = 0; i < 3; ++i) {
         S* const at = at_[i].get() + pose * (count_ + kBlock);
-        std::fill(at + total, at + total + kBlock, S(0));  // read, never used
+        std::fill(at + total, at + total + kBlock, S(0));  // the kernels read beyond the end, but do not use these values
         sorted.at[i] = at;
       }
     }
@@ -339,6 +349,7 @@ class CompleteSearch {
       }
   }
 
+  // Frees what the roots do not need, before they are collected.
   void release() {
     boxes_.reset();
     marked_.reset();
@@ -354,25 +365,31 @@ class CompleteSearch {
   const int64_t poses_, count_;
   const int threads_, chunks_;
   const Geometry<S> geometry_;
-  const int64_t nodes_;
-  const S* const points_;
-  const int64_t stride_;
-  const S* const transforms_;
+  const int64_t nodes_;        // V
+  const S* const points_;      // the first query of the first pose
+  const int64_t stride_;       // numbers from the points of one pose to those of the next
+  const S* const transforms_;  // [poses, V, 12]
   const snarf_complete& settings_;
   Queue box_queue_, extent_queue_, mark_queue_, count_queue_, scan_queue_, place_queue_, search_queue_;
-  std::unique_ptr<BlockBoxes<S>[]> boxes_;
-  std::vector<Extent<S>> box_extents_, query_extents_;
-  std::vector<SortedQueries<S>> sorted_;
-  std::vector<int64_t> bin_offset_;
-  std::unique_ptr<std::atomic<uint8_t>[]> marked_;
-  std::unique_ptr<int32_t[]> histogram_, begin_, key_, query_;
-  std::unique_ptr<S[]> at_[3];
+  std::unique_ptr<BlockBoxes<S>[]> boxes_;          // [poses, blocks]
+  std::vector<Extent<S>> box_extents_;              // [threads, poses]
+  std::vector<Extent<S>> query_extents_;            // [poses, chunks]
+  std::vector<SortedQueries<S>> sorted_;            // [poses]
+  std::vector<int64_t> bin_offset_;                 // [poses + 1], number of bins of all poses before
+  std::unique_ptr<std::atomic<uint8_t>[]> marked_;  // [bins of all poses], whether a box touches the bin
+  std::unique_ptr<int32_t[]> histogram_;            // by pose, [chunks, bins]; `scan` turns numbers into positions
+  std::unique_ptr<int32_t[]> begin_;                // by pose, [bins + 1], position of the first query of each bin
+  std::unique_ptr<int32_t[]> key_;                  // [poses, count], bin of each query; -1 for those that are dropped
+  std::unique_ptr<int32_t[]> query_;                // [poses, count], index in the group of each sorted query
+  std::unique_ptr<S[]> at_[3];                      // [poses, count + kBlock], coordinates of each sorted query, metres
 };
 
+// Number of threads for `count` items of work (queries, roots or nodes).
 inline int threads_for(const snarf_queries& queries, int64_t count) {
   return int(std::max<int64_t>(1, std::min<int64_t>(queries.threads, count / kWorkPerThread)));
 }
 
+// Finds the roots of all queries, group by group, and appends them to `out`.
 template <class S>
 void complete_search(const snarf_field& field, const snarf_queries& queries, const snarf_complete& settings, RootsOf<S>& out) {
   const std::vector<Block> blocks = active_blocks(field, settings.active);

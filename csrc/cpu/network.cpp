@@ -1,9 +1,10 @@
 // The canonical occupancy network without gradients, compiled once per instruction set.
 //
-// DESIGN. A tile of points runs through all layers before the next one starts; one lane is one point, and an array of values is
-// [value, point], so that activations, the encoding and the distance to the bones need no shuffles. A layer is summed for six
-// outputs and a few packs of points at once: their sums fill the registers, each value loaded serves six products and each
-// weight a pack for every product, so the multipliers and not the memory set the pace. Weights are packed in the order of use.
+// DESIGN. A tile of points goes through all layers before the next tile starts. A SIMD lane is a point, and arrays of values
+// are [value, point], so that activations, the encoding and the distance to the bones need no shuffles. A layer is computed for
+// kOutputs outputs and kPacks packs of points at once, whose sums stay in registers. Each loaded pack of values is used for
+// kOutputs products, and each loaded weight for kPacks products, so that arithmetic, not memory, limits the speed. The weights
+// are stored in the order in which they are used.
 #include <math.h>
 
 #include "lanes.h"
@@ -14,11 +15,12 @@ namespace SNARF_ISA {
 namespace {
 
 using V = Lanes<float>;
-constexpr int kPacks = kVectorBytes == 64 ? 4 : 2;  // of points at once: 24 sums of 32 registers, or 12 of 16
-constexpr int kColumn = kPacks * V::width;
+constexpr int kPacks = kVectorBytes == 64 ? 4 : 2;  // the sums take 24 of 32 vector registers, or 12 of 16
+constexpr int kColumn = kPacks * V::width;          // points whose sums are computed at once
 static_assert(kTile % kColumn == 0, "tiles are made of whole columns");
 
-// sums[o][p] += weights[k][o] * values[k][p] for all k.
+// sums[o][p] += weights[k][o] * values[k][p] for all k < count. `weights` is [count, kOutputs]; a row of `values` has kTile
+// points, of which the first kColumn are used.
 SNARF_HD void add_products(const float* weights, const float* values, int count, V (*sums)[kPacks]) {
   for (int k = 0; k < count; ++k) {
     V value[kPacks];
@@ -33,7 +35,8 @@ SNARF_HD void add_products(const float* weights, const float* values, int count,
   }
 }
 
-// e^x for x <= 0, to 4e-6 of it down to -20; smaller ones count as that.
+// e^x for x <= 0, with a relative error of at most 4e-6. An x below -20 counts as -20. Computed as (e^(x / 64))^64, the inner
+// one by its Taylor series.
 SNARF_HD V decay(V x) {
   const V y = larger(x, V(-20.f)) * V(1.f / 64);
   V e = V(1.f / 720);
@@ -48,11 +51,11 @@ SNARF_HD V decay(V x) {
   return e;
 }
 
-// log(1 + e^(s x)) / s. NaN stays NaN.
+// log(1 + e^(sharpness x)) / sharpness. NaN stays NaN.
 SNARF_HD V softplus(V x, float sharpness) {
   const V positive = select(x <= 0.f, V(0.f), x);
   const V scaled = absolute(x) * sharpness;
-  if (!any(scaled < 20.f)) return positive;  // the rest is below what a float resolves
+  if (!any(scaled < 20.f)) return positive;  // what is left out is below 2.1e-9 / sharpness
   // log(1 + e) = 2 artanh(e / (2 + e)), whose argument is at most a third
   const V e = decay(V(0.f) - scaled);
   const V t = e / (e + 2.f), q = t * t;
@@ -64,11 +67,13 @@ SNARF_HD V softplus(V x, float sharpness) {
   return positive + series * t * V(2.f / sharpness);
 }
 
+// `activation` is numbered as in NetworkLayer.
 SNARF_HD V activated(V x, int activation, float sharpness) {
   if (activation == 1) return select(x <= 0.f, V(0.f), x);
   return activation == 2 ? softplus(x, sharpness) : x;
 }
 
+// One layer for a tile. `hidden`, `encoded`, `extras` and `out` are [value, kTile]; out has layer.outputs rows.
 void run_layer(const NetworkLayer& layer, const float* hidden, const float* encoded, const float* extras, float sharpness,
                float* out) {
   const int inputs = layer.hidden + layer.encoded + layer.extras;
@@ -90,11 +95,12 @@ void run_layer(const NetworkLayer& layer, const float* hidden, const float* enco
   }
 }
 
-// Sine and cosine of angles up to some thousands, to 2e-7 (Cody and Waite's reduction by quarter turns, then Taylor's series).
+// Sine and cosine of angles up to a few thousand radians, with an error of at most 2e-7: Cody and Waite's reduction by quarter
+// turns, then Taylor series.
 SNARF_HD void sine_cosine(V angle, V& sine, V& cosine) {
-  const V turns = angle * V(0.63661977236758134f);
+  const V turns = angle * V(0.63661977236758134f);  // quarter turns: 2 / pi per radian
   const V quarter = truncate(turns + select(turns >= 0.f, V(0.5f), V(-0.5f)));
-  V r = angle - quarter * V(1.5703125f);
+  V r = angle - quarter * V(1.5703125f);  // pi / 2 in three parts, so that little is lost by rounding
   r = r - quarter * V(4.83751296997e-4f);
   r = r - quarter * V(7.549789948769e-8f);
   const V q = r * r;
@@ -109,7 +115,7 @@ SNARF_HD void sine_cosine(V angle, V& sine, V& cosine) {
   c = c * q + V(1.f);
   const V half = truncate(quarter * V(0.5f)), fourth = truncate(quarter * V(0.25f));
   const V odd = absolute(quarter - half * V(2.f));  // 1 on odd quarters
-  const V rest = quarter - fourth * V(4.f);         // -3 to 3
+  const V rest = quarter - fourth * V(4.f);         // quarter turns without full turns, -3 to 3
   const LaneMask<float> swap = odd > 0.5f;
   const LaneMask<float> sine_down = ((rest >= 1.5f) & (rest <= 3.5f)) | ((rest >= -2.5f) & (rest <= -0.5f));
   const LaneMask<float> cosine_down = ((rest >= 0.5f) & (rest <= 2.5f)) | ((rest >= -3.5f) & (rest <= -1.5f));
@@ -118,7 +124,8 @@ SNARF_HD void sine_cosine(V angle, V& sine, V& cosine) {
   cosine = select(cosine_down, V(0.f) - b, b);
 }
 
-// The points themselves, then sines of all axes and frequencies, then cosines, as OccupancyNetwork._encode has them.
+// The points themselves, then the sines for all frequencies and axes, then the cosines, in the order of
+// OccupancyNetwork._encode (snarfcli/shape/network.py). `points` is [3, kTile], `encoded` [3 + 6 K, kTile] with K frequencies.
 void encode(const NetworkTask& task, const float* points, float* encoded) {
   const int waves = 3 * task.frequency_count;
   for (int axis = 0; axis < 3; ++axis)
@@ -134,10 +141,10 @@ void encode(const NetworkTask& task, const float* points, float* encoded) {
     }
 }
 
-// Adds the capsules around the bones (snarfcli/segments.py).
+// Adds to `values` [kTile] the logits of capsules around the bones, as OccupancyNetwork does. `points` is [3, kTile].
 void add_capsules(const NetworkTask& task, const float* points, float* values) {
   for (int i = 0; i < kTile; i += V::width) {
-    V x[3], nearest(3.4e38f);
+    V x[3], nearest(3.4e38f);  // squared distance to the nearest bone
     for (int axis = 0; axis < 3; ++axis) x[axis] = load<float>(points + axis * kTile + i);
     for (int s = 0; s < task.segment_count; ++s) {
       const float* const start = task.segments + 6 * s;
@@ -165,6 +172,8 @@ void add_capsules(const NetworkTask& task, const float* points, float* values) {
   }
 }
 
+// Evaluates points first to last (see NetworkKernel). The first layer has no hidden inputs, so `values` needs no initial
+// content.
 void run_network(const NetworkTask& task, int64_t first, int64_t last, float* scratch) {
   const int64_t tile = kTile;
   float* const encoded = scratch;
@@ -182,9 +191,9 @@ void run_network(const NetworkTask& task, int64_t first, int64_t last, float* sc
     encode(task, points, encoded);
     for (int n = 0; n < task.layer_count; ++n) {
       run_layer(task.layers[n], values, encoded, extras, task.sharpness, next);
-      float* const before = values;
+      float* const previous = values;
       values = next;
-      next = before;
+      next = previous;
     }
     if (task.segment_count) add_capsules(task, points, values);
     for (int i = 0; i < count; ++i) task.out[begin + i] = values[i];

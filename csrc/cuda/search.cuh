@@ -1,6 +1,6 @@
 // Shared by the kernels of a search: their arguments, and the report of a root.
 //
-// Every kernel of a search takes the same structure by value; snarfcli/native/cuda.py fills it in. SNARF_NUMBER is float or
+// Every kernel of a search takes the same structure by value; snarfcli/native/cuda_launches.py fills it in. SNARF_NUMBER is float or
 // double: NVRTC compiles each source once for either.
 #pragma once
 

@@ -97,7 +97,7 @@ class ForwardDeformer(nn.Module):
     def search(self, search: SearchConfig) -> None:
         if self.searches_field and search.name != "broyden":
             raise ValueError(
-                f"search.name: wanted broyden for skinning.name 'mlp', got {search.name!r}: it has no cells to search"
+                f"search.name: wanted broyden for skinning.name 'mlp', got {search.name!r}: the field has no cells"
             )
         self._search = search
 

@@ -167,11 +167,7 @@ class _Skinning:
 
 
 def _iterate(
-    at_pose: _Skinning,
-    points: Tensor,
-    query: Tensor,
-    x: Tensor,
-    settings: _Settings,
+    at_pose: _Skinning, points: Tensor, query: Tensor, x: Tensor, settings: _Settings
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Run Broyden's method for each pair of query [S] and start [S, 3]; return roots, their queries and J^-1, by start."""
     x = settings.bounded(x)
@@ -204,12 +200,7 @@ def _iterate(
 
 
 def _finish(
-    at_pose: _Skinning,
-    points: Tensor,
-    x: Tensor,
-    query: Tensor,
-    inverse: Tensor,
-    settings: _Settings,
+    at_pose: _Skinning, points: Tensor, x: Tensor, query: Tensor, inverse: Tensor, settings: _Settings
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Replace the approximate inverse Jacobians by exact ones, and polish the roots with one short Newton step.
 

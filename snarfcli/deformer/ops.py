@@ -67,7 +67,7 @@ def complete_search(
     Returns:
         canonical [M, 3], query [M], jacobian_inverse [M, 3, 3], and the number of roots found, [1].
     """
-    _check_default_kernel(points, backend)
+    choose_backend(backend, points.device.type)  # raises for "native", warns for "auto": there are no native kernels
     return complete_search_reference(
         points, transforms, lower, upper, shape, active_cells, tolerance, max_steps, orientation_preserving, capacity
     )
@@ -88,9 +88,10 @@ def complete_search_reference(
     """The readable version of `complete_search`."""
     grid, nodes = _grid(lower, upper, shape)
     metres = tolerance * grid.longest_side
-    settings = {"active_cells": active_cells, "tolerance": metres, "max_steps": max_steps}
     with torch.autocast(points.device.type, enabled=False):
-        roots = complete_roots(points, transforms, grid, nodes, **settings)
+        roots = complete_roots(
+            points, transforms, grid, nodes, active_cells=active_cells, tolerance=metres, max_steps=max_steps
+        )
     return fit_to_capacity(*_reference_result(roots, orientation_preserving), points, capacity)
 
 
@@ -118,7 +119,7 @@ def broyden_search(
         divergence: residual at which a start is given up, as a share of the box's longest side.
         exact_jacobian: whether the inverse Jacobian is the exact one at the root or the iteration's approximation.
     """
-    _check_default_kernel(points, backend)
+    choose_backend(backend, points.device.type)  # raises for "native", warns for "auto": there are no native kernels
     settings = (tolerance, divergence, max_steps, exact_jacobian, orientation_preserving, capacity)
     return broyden_search_reference(points, transforms, starts, lower, upper, shape, *settings)
 
@@ -178,7 +179,7 @@ def implicit_backward(
 
     Source: SNARF Eq. 14.
     """
-    _check_default_kernel(gradient, backend)
+    choose_backend(backend, gradient.device.type)  # as above
     roots = (gradient, canonical, query, jacobian_inverse)
     return implicit_backward_reference(*roots, lower, upper, shape, batch, count, wants_points, wants_transforms)
 
@@ -221,11 +222,6 @@ def implicit_backward_reference(
 
 
 # ---------------------------------------------------------------- native kernels
-def _check_default_kernel(tensor: Tensor, backend: str) -> None:
-    """Raise if the native backend is asked for, and warn for "auto", where only the reference can run."""
-    choose_backend(backend, tensor.device.type)
-
-
 def _register_native(operator: CustomOpDef, device_type: str, native: Callable, reference: Callable) -> None:
     """Register `native` for one type of device, replaced by `reference` depending on the last argument, `backend`."""
 

@@ -16,15 +16,15 @@ class SkinningConfig:
     """Weight field: distilled (a network evaluated at the grid nodes), voxel (optimised at the nodes), mlp (a network that is
     searched directly, as in SNARF) or preset (given, not trained)."""
     softmax: str = "plain"
-    """From logits to weights: plain, or hierarchical down the tree of joints; no effect on preset weights."""
+    """How logits become weights: plain, or hierarchical down the tree of joints; no effect on preset weights."""
     resolution: list[int] = field(default_factory=lambda: [64, 64, 16])
-    """Grid nodes along x, y, z. For a skeleton other than SMPL's the total is kept and divided by the sides of its box."""
+    """Grid nodes along x, y, z. For a skeleton other than SMPL's the same total is distributed by the sides of its box."""
     margin_m: list[float] = field(default_factory=lambda: [0.12, 0.12, 0.20])
     """Margin of the grid's box around the canonical body on either side, along x, y, z, metres."""
     bone_radius_m: float | None = 0.22
     """Cells with a corner at most this far from a bone are searched at first, metres; null always searches every cell."""
     surface_radius_m: float = 0.12
-    """So are cells at most this far from the rough points of the body that the grid's box was made from, metres."""
+    """Cells at most this far from the rough points of the body that give the grid's box are searched too, metres."""
     width: int = 128
     """Width of the network's hidden layers."""
     depth: int = 4

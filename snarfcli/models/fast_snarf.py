@@ -118,7 +118,7 @@ class FastSnarf(System):
         Only active cells are sampled: elsewhere the network was never trained.
 
         Args:
-            pose: [P, J, 3] axis-angle, radians.
+            pose: [P, J, 3], axis-angle, radians.
             threshold: logit above which a sample counts as occupied; samples lie at most 4 cm apart.
             reach_m: cells at most this far from an occupied sample, along each axis, are included, active or not.
             precision: of the shape network.

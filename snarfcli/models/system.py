@@ -106,7 +106,7 @@ class System(nn.Module):
         Args:
             points: [B, N, 3], posed space, metres.
             bone_transforms: [B, J, 4, 4], canonical to posed.
-            pose: [B, J, 3] axis-angle, radians.
+            pose: [B, J, 3], axis-angle, radians.
             precision: of the shape network (see `PRECISIONS`); `find` always runs in full float32.
         """
         return self.shape_at(self.find(points, bone_transforms, pose), pose, precision)

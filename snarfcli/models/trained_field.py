@@ -180,7 +180,7 @@ class TrainedField:
         """Return the bone transforms [B, J, 4, 4], canonical to posed, metres, of poses.
 
         Args:
-            pose: [B, J, 3] axis-angle, radians, global orientation included.
+            pose: [B, J, 3], axis-angle, radians, global orientation included.
             translation: [B, 3], metres.
 
         Raises:
@@ -212,7 +212,7 @@ class TrainedField:
 
         Args:
             points: [B, N, 3], posed frame, metres.
-            pose: [B, J, 3] axis-angle, radians, global orientation included.
+            pose: [B, J, 3], axis-angle, radians, global orientation included.
             translation: [B, 3], metres.
         """
         return self.query(points, self.bone_transforms(pose, translation), pose).logits.sigmoid()

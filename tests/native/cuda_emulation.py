@@ -1,4 +1,4 @@
-"""Runs the launches of snarfcli.native.cuda on the CPU: the kernels of csrc/cuda, compiled as C++ (emulation/cuda_shim.h)."""
+"""Run snarfcli.native.cuda_launches on the CPU: the kernels of csrc/cuda, compiled as C++ (emulation/cuda_shim.h)."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from snarfcli.deformer import (
 )
 from snarfcli.deformer.correspondences import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
-from snarfcli.native import cpu, cuda, cuda_compile, cuda_driver
+from snarfcli.native import cpu, cuda, cuda_compile, cuda_driver, cuda_launches
 from snarfcli.native.library import native_library
 
 SHAPE = (6, 7, 8)
@@ -49,7 +49,7 @@ class Runner:
 
     def complete(self, points, transforms, grid, shape, active=None, **changed):
         settings = {"tolerance": 5e-6, "max_steps": 10, "orientation_preserving": False, "capacity": None} | changed
-        return self(cuda.run_complete, points, transforms, grid.lower, grid.upper, shape, active, *settings.values())
+        return self(cuda_launches.run_complete, points, transforms, grid.lower, grid.upper, shape, active, *settings.values())
 
     def broyden(self, points, transforms, starts, grid, shape, **changed):
         settings = {
@@ -60,7 +60,7 @@ class Runner:
             "orientation_preserving": False,
             "capacity": None,
         } | changed
-        return self(cuda.run_broyden, points, transforms, starts, grid.lower, grid.upper, shape, *settings.values())
+        return self(cuda_launches.run_broyden, points, transforms, starts, grid.lower, grid.upper, shape, *settings.values())
 
 
 @pytest.fixture(params=["emulated", "cuda"] if HAS_GPU else ["emulated"])
@@ -112,11 +112,11 @@ def check_against_truth(canonical, query, points, pose, weights, grid):
 # ---------------------------------------------------------------- arguments
 def test_constants_are_those_of_the_headers():
     shared = (cuda_compile.cuda_sources() / "include" / "snarf" / "search.h").read_text()
-    assert f"kSameRoot = {cuda._SAME_ROOT:.0e};".replace("e-0", "e-") in shared
-    assert f"kSameBroydenRoot = {cuda._SAME_BROYDEN_ROOT:.0e};".replace("e-0", "e-") in shared
+    assert f"kSameRoot = {cuda_launches._SAME_ROOT:.0e};".replace("e-0", "e-") in shared
+    assert f"kSameBroydenRoot = {cuda_launches._SAME_BROYDEN_ROOT:.0e};".replace("e-0", "e-") in shared
     complete = (cuda_compile.cuda_sources() / "cuda" / "complete.cu").read_text()
-    assert f"kThreads = {cuda._THREADS};" in complete
-    assert f"kCurvedThreads = {cuda._CURVED_THREADS};" in complete
+    assert f"kThreads = {cuda_launches._THREADS};" in complete
+    assert f"kCurvedThreads = {cuda_launches._CURVED_THREADS};" in complete
 
 
 def test_functions_take_what_the_operators_take():
@@ -130,8 +130,8 @@ def test_functions_take_what_the_operators_take():
 def test_structures_match_the_kernels(emulated):
     for dtype in (torch.float32, torch.float64):
         library = build_emulation(dtype)
-        assert library.search_bytes() == ctypes.sizeof(cuda._Search)
-        assert library.backward_bytes() == ctypes.sizeof(cuda._Backward)
+        assert library.search_bytes() == ctypes.sizeof(cuda_launches._Search)
+        assert library.backward_bytes() == ctypes.sizeof(cuda_launches._Backward)
 
 
 @pytest.mark.parametrize(("bones", "angle"), [(2, 0.3), (24, 0.2)])
@@ -225,7 +225,7 @@ def test_roots_on_faces_come_once(runner):
 def test_result_does_not_depend_on_the_size_of_a_block(emulated, block, dtype, monkeypatch):
     # Real threads: a missing barrier, a race on shared memory or a wrong share of the work would show. Leaving out
     # any one barrier of complete.cu is reported here by ThreadSanitizer (build_emulation() tells how to use it).
-    monkeypatch.setattr(cuda, "_CURVED_BLOCKS", 2)  # that take turns
+    monkeypatch.setattr(cuda_launches, "_CURVED_BLOCKS", 2)  # that take turns
     points, poses, _weights, grid, transforms = scene(24, 0.8, dtype, batch=2, count=150, shape=(3, 4, 4))
     one = emulated.complete(points, transforms, grid, (3, 4, 4))
     assert len(one[1]) > 300
@@ -246,11 +246,11 @@ def test_result_does_not_depend_on_batch_groups_or_guesses(runner, monkeypatch):
         assert torch.equal(whole[0][mine], alone[0])
         assert torch.equal(whole[2][mine], alone[2])
         assert torch.equal(whole[1][mine] - 200 * b, alone[1])
-    one_cell = 4 * cuda._RECORD_NUMBERS
+    one_cell = 4 * cuda_launches._RECORD_NUMBERS
     for group_bytes in (one_cell * 50, one_cell * 210, one_cell * 450):  # parts of a pose's 210 cells, one pose, two poses
-        monkeypatch.setattr(cuda, "_GROUP_BYTES", group_bytes)
+        monkeypatch.setattr(cuda_launches, "_GROUP_BYTES", group_bytes)
         assert all(torch.equal(a, b) for a, b in zip(whole, runner.complete(points, transforms, grid, SHAPE), strict=True))
-    monkeypatch.setattr(cuda, "_first_guess", lambda queries: 10)
+    monkeypatch.setattr(cuda_launches, "_first_guess", lambda queries: 10)
     assert all(torch.equal(a, b) for a, b in zip(whole, runner.complete(points, transforms, grid, SHAPE), strict=True))
 
 
@@ -280,7 +280,7 @@ def test_capacity_pads_cuts_and_counts(runner):
 def test_slots_that_run_out_are_counted_and_not_overrun(emulated, monkeypatch):
     points, _, _, grid, transforms = scene(24, 0.7, batch=1)
     rows = len(emulated.complete(points, transforms, grid, SHAPE)[1])
-    monkeypatch.setattr(cuda, "_slots_for", lambda capacity: 20)
+    monkeypatch.setattr(cuda_launches, "_slots_for", lambda capacity: 20)
     _canonical, query, _, found = emulated.complete(points, transforms, grid, SHAPE, capacity=rows)
     assert int(found) >= rows  # more than were kept: the caller can tell
     assert int((query < 200).sum()) <= 20
@@ -397,9 +397,9 @@ def test_strides_and_addresses_do_not_matter(runner):
 def test_too_many_queries_are_rejected():
     points = torch.empty(1, 1, 3).expand(2**16, 2**15, 3)
     with pytest.raises(ValueError, match="points: wanted fewer than 2"):
-        cuda._check_limits(points.shape[0] * points.shape[1], 1)
+        cuda_launches._check_limits(points.shape[0] * points.shape[1], 1)
     with pytest.raises(ValueError, match=r"fewer than 2.31 grid cells"):
-        cuda._check_limits(1, 2**31)
+        cuda_launches._check_limits(1, 2**31)
 
 
 # ---------------------------------------------------------------- gradient
@@ -414,12 +414,12 @@ def test_gradient_equals_the_reference(runner, dtype, block):
     if runner.device == "emulated":
         runner.block = block
     wanted = ops.implicit_backward_reference(*roots, grid.lower, grid.upper, SHAPE, 3, 60, True, True)
-    found = runner(cuda.run_backward, *roots, grid.lower, grid.upper, SHAPE, 3, 60, True, True)
+    found = runner(cuda_launches.run_backward, *roots, grid.lower, grid.upper, SHAPE, 3, 60, True, True)
     for mine, theirs in zip(found, wanted, strict=True):
         rounding = 1e-5 if dtype == torch.float32 else 1e-13
         torch.testing.assert_close(mine, theirs, rtol=0, atol=rounding * float(theirs.abs().max()))
     for wants in ((True, False), (False, True), (False, False)):
-        part = runner(cuda.run_backward, *roots, grid.lower, grid.upper, SHAPE, 3, 60, *wants)
+        part = runner(cuda_launches.run_backward, *roots, grid.lower, grid.upper, SHAPE, 3, 60, *wants)
         for mine, theirs, wanted_it in zip(part, found, wants, strict=True):
             assert torch.allclose(mine, theirs) if wanted_it else mine.numel() == 0
 
@@ -428,7 +428,7 @@ def test_gradient_of_no_roots_is_zero(runner):
     grid = unit_grid()
     empty = torch.zeros(0, 3).double()
     roots = (empty, empty, torch.zeros(0, dtype=torch.long), torch.zeros(0, 3, 3).double())
-    v_points, v_transforms = runner(cuda.run_backward, *roots, grid.lower, grid.upper, SHAPE, 2, 5, True, True)
+    v_points, v_transforms = runner(cuda_launches.run_backward, *roots, grid.lower, grid.upper, SHAPE, 2, 5, True, True)
     assert v_points.shape == (2, 5, 3)
     assert v_transforms.shape == (2, 336, 12)
     assert not v_points.any()

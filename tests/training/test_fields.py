@@ -155,5 +155,7 @@ def test_settings_that_do_not_fit_make_nothing(config_for, changes, message):
 def test_a_field_without_cells_is_not_evaluated_cell_by_cell(config_for):
     config = config_for("mlp")
     run(config)
-    with pytest.raises(UserError, match=r"'mlp' needs search.name 'broyden', got 'complete'.*; leave search out"):
+    with pytest.raises(
+        UserError, match=r"search.name: wanted broyden for skinning.name 'mlp', got 'complete'.*; leave search out"
+    ):
         evaluate(eval_config(config, SearchConfig("complete")))

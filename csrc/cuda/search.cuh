@@ -1,7 +1,7 @@
 // Shared by the kernels of a search: their arguments, and the report of a root.
 //
-// Every kernel of a search takes the same structure by value; snarfcli/native/cuda_launches.py fills it in. SNARF_NUMBER is float or
-// double: NVRTC compiles each source once for either.
+// Every kernel of a search takes the same structure by value; snarfcli/native/cuda_launches.py fills it in. SNARF_NUMBER is
+// float or double: NVRTC compiles each source once for either.
 #pragma once
 
 #include "snarf/grid.h"

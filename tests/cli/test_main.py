@@ -1,4 +1,4 @@
-"""The command line: help, flags, and one line for everything that a user can get wrong."""
+"""The command line: help, flags, and user errors in one line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COMMANDS = ("preprocess", "train", "eval", "animate", "export", "doctor", "repro
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """Run in an empty folder: no command may depend on where it is called, or leave something behind."""
+    """Run in an empty folder: commands must not depend on the current folder, or leave files there."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -174,7 +174,7 @@ def test_views_and_contents_side_by_side(config):
 
 
 def test_meshes_do_not_depend_on_what_is_beside(config, tmp_path):
-    """Else a run that goes on with other panels would mix two kinds of colours."""
+    """Otherwise a continued run with other panels would mix two kinds of colours."""
     written = []
     for beside in ([], ["weights"]):
         folder = tmp_path / f"beside_{len(beside)}"
@@ -241,7 +241,7 @@ def test_an_interrupted_run_goes_on(config, toy, monkeypatch, caplog):
     assert record_of(config)["complete"] is True
 
 
-def test_other_settings_are_refused_and_overwrite_starts_again(config):
+def test_other_settings_are_rejected_and_overwrite_starts_again(config):
     short = replace(config, max_frames=2, video=False)
     run(short)
     with pytest.raises(UserError, match=r"resolution 32 \(now 24\); give overwrite=true to replace them, or output="):
@@ -249,7 +249,7 @@ def test_other_settings_are_refused_and_overwrite_starts_again(config):
     with pytest.raises(UserError, match=r"step 1 \(now 2\)"):
         run(replace(short, step=2))
     first = (folder_of(config) / "frame_000000.ply").stat().st_mtime_ns
-    assert run(replace(short, max_frames=3)) == 0  # a longer part of the same motion keeps what is there
+    assert run(replace(short, max_frames=3)) == 0  # a longer part of the same motion keeps the existing frames
     assert (folder_of(config) / "frame_000000.ply").stat().st_mtime_ns == first
     assert (folder_of(config) / "frame_000002.ply").exists()
     (Path(config.output_root) / "builtin" / "50002" / "fast_snarf" / "avatar.pt").write_bytes(b"trained again")
@@ -349,7 +349,7 @@ def test_what_a_user_can_get_wrong(config, change, message):
     assert not folder_of(config).exists()
 
 
-def test_a_motion_of_another_skeleton_is_refused(config, tmp_path):
+def test_a_motion_of_another_skeleton_is_rejected(config, tmp_path):
     np.savez(tmp_path / "smpl.npz", poses=np.zeros((2, 72)), trans=np.zeros((2, 3)))
     with pytest.raises(UserError, match="wanted 6 values per frame, got 72"):
         run(replace(config, pose=str(tmp_path / "smpl.npz")))

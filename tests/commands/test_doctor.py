@@ -1,4 +1,4 @@
-"""`snarf doctor`: it tells what is there and what is not, and ends well on a broken machine too."""
+"""`snarf doctor`: the report, also on a machine with a broken installation."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def toy_avatar(store: SampleStore, subject: str = "toy") -> Avatar:
 
 @pytest.fixture
 def config(store: SampleStore, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> EvalConfig:
-    """Settings that evaluate the toy avatar, which lies in its run folder."""
+    """Settings that evaluate the toy avatar in its run folder."""
     caplog.set_level(logging.INFO, "snarfcli")
     output_root = tmp_path / "outputs"
     toy_avatar(store).save(output_root / "builtin" / "toy" / "fast_snarf" / "avatar.pt")
@@ -127,11 +127,13 @@ def test_another_search_leaves_the_avatars_own_results(config):
 
 
 def test_results_go_beside_a_given_checkpoint(config, store, tmp_path, caplog):
-    toy_avatar(store, subject="somebody").save(tmp_path / "elsewhere" / "mine.pt")
+    toy_avatar(store, subject="other").save(tmp_path / "elsewhere" / "mine.pt")
     run(replace(config, ckpt=str(tmp_path / "elsewhere" / "mine.pt")))
-    assert read(tmp_path / "elsewhere" / "eval_id_toy")["frames"] == 3  # somebody's own results are another folder
+    assert (
+        read(tmp_path / "elsewhere" / "eval_id_toy")["frames"] == 3
+    )  # the results of the avatar's own subject have another folder
     assert not (folder_of(config) / "eval_id").exists()
-    assert "trained on subject somebody and is evaluated on subject toy" in caplog.text
+    assert "trained on subject other and is evaluated on subject toy" in caplog.text
 
 
 def test_no_avatar_names_the_command_that_makes_one(config):
@@ -151,7 +153,7 @@ def test_an_unknown_subject_is_named_with_the_nearest_one(config):
         run(replace(config, subject="50003"))
 
 
-def test_an_avatar_of_another_skeleton_is_refused(config, store):
+def test_an_avatar_of_another_skeleton_is_rejected(config, store):
     skeleton = store.skeleton
     joints = torch.cat([skeleton.joints_rest, torch.tensor([[1.0, 0, 0]])])
     longer = replace(
@@ -222,7 +224,7 @@ def test_the_figure_shows_worst_and_best_frames(config, caplog):
     picture = np.asarray(Image.open(folder_of(config) / "eval_id" / "frames.png"))
     assert picture.shape[1] > picture.shape[0] > 320  # one row of six pictures
     assert str(folder_of(config) / "eval_id" / "frames.png") in caplog.text
-    # figures of former numbers do not stay
+    # a figure of older numbers is deleted
     run(replace(config, figure=False))
     assert not (folder_of(config) / "eval_id" / "frames.png").exists()
 

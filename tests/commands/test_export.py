@@ -161,7 +161,7 @@ def test_clips_of_similar_names_have_a_folder_each_too(folder, capsys):
     assert [len(list((Path("out") / place).glob("*.obj"))) for place in places] == [2, 2, 2, 2]
 
 
-def test_folders_that_cannot_be_replaced_are_refused_at_once(folder, toy, capsys, monkeypatch):
+def test_folders_that_cannot_be_replaced_are_rejected_at_once(folder, toy, capsys, monkeypatch):
     monkeypatch.setattr(toy, "skinned_surface", None)  # nothing is made
     arguments = ("--pose", pose_file("walk.npz", 2), "format=ply", "overwrite=true")
     Path("circle").symlink_to("circle")
@@ -220,7 +220,7 @@ def test_an_existing_file_stays_until_overwrite(folder, capsys):
     path = folder / "export" / "50002.glb"
     path.parent.mkdir()
     path.write_bytes(b"mine")
-    (folder / "avatar.pt").unlink()  # refused before anything is looked at
+    (folder / "avatar.pt").unlink()  # rejected before any file is read
     code, err = export(capsys, *arguments)
     assert code == 2
     assert err.endswith("50002.glb exists already; give overwrite=true to replace it, or output=FILE\n")
@@ -315,7 +315,7 @@ def test_what_a_user_can_get_wrong(folder, capsys, arguments, message):
 
 
 @pytest.mark.parametrize("logit", [-1.0, 1.0])
-@pytest.mark.parametrize("height", ["file", "ground"])  # the ground is looked for on the surface too
+@pytest.mark.parametrize("height", ["file", "ground"])  # ground also evaluates the surface
 @pytest.mark.parametrize("suffix", ["glb", "ply"])
 def test_an_avatar_without_surface_is_a_line(folder, capsys, monkeypatch, logit, suffix, height):
     monkeypatch.setattr(ToyCharacter, "canonical_logits", lambda self, points, pose: torch.full((len(points),), logit))
@@ -327,7 +327,7 @@ def test_an_avatar_without_surface_is_a_line(folder, capsys, monkeypatch, logit,
     assert not (folder / "export").exists()
 
 
-def test_an_avatar_without_weights_is_refused(folder, toy, capsys, monkeypatch):
+def test_an_avatar_without_weights_is_rejected(folder, toy, capsys, monkeypatch):
     monkeypatch.setattr(ToyCharacter, "has_skinning_weights", False)
     code, err = export(capsys, "--pose", pose_file("walk.npz"))
     assert code == 2
@@ -338,7 +338,7 @@ def test_an_avatar_without_weights_is_refused(folder, toy, capsys, monkeypatch):
 # ---------------------------------------------------------------- through Blender
 @pytest.fixture
 def fake_blender(tmp_path, monkeypatch):
-    """Return what puts a program named blender on the path, alone."""
+    """Return a function that makes a program named blender the only one on the path."""
     monkeypatch.setattr(blender.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
 
@@ -370,7 +370,7 @@ def test_blender_gets_a_whole_glb(folder, capsys, fake_blender):
 
 
 @pytest.mark.parametrize("kind", ["fbx", "usd"])
-def test_blender_is_told_the_format_whatever_the_case_of_the_suffix(folder, capsys, fake_blender, kind):
+def test_blender_is_told_the_format_for_any_case_of_the_suffix(folder, capsys, fake_blender, kind):
     fake_blender("open(path, 'w').write(kind + path[-4:]); print('snarf: written')")
     assert export(capsys, "--pose", pose_file("walk.npz", 2), f"format={kind}", f"output=ME.{kind.upper()}")[0] == 0
     assert Path(f"ME.{kind.upper()}").read_text() == f"{kind}.{kind}"

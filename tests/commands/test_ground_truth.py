@@ -1,4 +1,4 @@
-"""The true meshes of a motion: those of the built-in bodies in any pose, and those of the samples."""
+"""Ground-truth meshes of a motion: built-in bodies in any pose, and sequences of samples."""
 
 from __future__ import annotations
 

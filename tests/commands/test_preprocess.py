@@ -31,7 +31,7 @@ from snarfcli.sampling import occupancies
 
 @pytest.fixture
 def subject(monkeypatch: pytest.MonkeyPatch) -> list[SubjectData]:
-    """Make the toy the only subject; a test may put another in its place."""
+    """Make the toy the only subject; a test can replace it."""
     holder = [toy_subject()]
 
     def load(name: str, request: DataRequest) -> SubjectData:
@@ -220,7 +220,7 @@ def test_a_broken_sequence_stops_the_run_or_is_left_out(
     assert not list(tmp_path.iterdir())
     with pytest.raises(UserError, match=r"mesh 000031.obj is damaged; give skip_broken=true"):
         preprocess.run(_config(tmp_path, sequences=["wave", "bend"]))
-    assert {name.split("/")[1] for name in _contents(tmp_path) if "/" in name} == {"wave"}  # what was complete stays
+    assert {name.split("/")[1] for name in _contents(tmp_path) if "/" in name} == {"wave"}  # complete sequences are kept
     preprocess.run(_config(tmp_path, skip_broken=True, workers=2))
     store = SampleStore.open(tmp_path, "builtin", "toy")
     assert [(entry["split"], entry["name"]) for entry in store.manifest["sequences"]] == [("test", "wave"), ("ood", "fold")]
@@ -253,7 +253,7 @@ def test_files_are_read_before_anything_is_lost(
     last.write_bytes(last.read_bytes()[:-100])
     with pytest.raises(UserError, match=r"fold_1\.ply.*; give skip_broken=true"):
         preprocess.run(_config(data, overwrite=True))
-    assert _contents(data) == before  # what was there is still there
+    assert _contents(data) == before  # existing samples are unchanged
     with pytest.raises(UserError, match=r"fold was made from other meshes .* delete it to make it again"):
         preprocess.run(_config(data))
     preprocess.run(_config(data, overwrite=True, skip_broken=True))

@@ -1,4 +1,4 @@
-"""Which part of a motion is taken, at which rate and where."""
+"""Selection of the frames of a motion, their frame rate, and in_place."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def skeleton() -> Skeleton:
 
 @pytest.fixture
 def walk(tmp_path) -> str:
-    """A body that turns about the vertical at half a turn a second and walks two metres a second."""
+    """A body that turns about the vertical axis (0.5 turns per second) and walks (2 m/s)."""
     time = np.arange(FRAMES) / RATE
     poses = np.zeros((FRAMES, 72))
     poses[:, 1] = np.pi * time
@@ -54,7 +54,7 @@ def test_frames_are_taken_as_asked_for(skeleton, walk):
 
 
 def test_resampling_keeps_the_pace(skeleton, walk):
-    chosen = choose(skeleton, walk, start=4, stop=21, frame_rate=60.0)  # 16 intervals of a 24th: two thirds of a second
+    chosen = choose(skeleton, walk, start=4, stop=21, frame_rate=60.0)  # 16 intervals of 1/24 s are 2/3 s
     motion = chosen.motion
     assert motion.frame_rate == 60
     assert motion.num_frames == 41
@@ -84,12 +84,12 @@ def test_stretching_joints_are_kept_and_cannot_be_resampled(skeleton, monkeypatc
     own = replace(AVATAR, data=DataConfig("meshes", 1, 1, 1))
     chosen = select_motion(replace(PLAIN, start=1, in_place=True), own, other, None, None)
     np.testing.assert_allclose(chosen.bone_transforms[:, :, :3, 3], np.tile([0, 1, 0], (2, 2, 1)), atol=1e-7)
-    assert transforms[2, 0, 0, 3] == 1  # what was read is as it was
+    assert transforms[2, 0, 0, 3] == 1  # the motion that was read is unchanged
     with pytest.raises(UserError, match="frame_rate: wanted a motion whose joints do not stretch, got run"):
         select_motion(replace(PLAIN, frame_rate=60.0), own, other, None, None)
 
 
-def test_what_cannot_be_used_is_refused(skeleton, walk):
+def test_what_cannot_be_used_is_rejected(skeleton, walk):
     with pytest.raises(UserError, match="start=90, stop=null leave no frame; walk has frames 0 to 24"):
         choose(skeleton, walk, start=90)
     for changes, message in (

@@ -1,4 +1,4 @@
-"""`snarf train` end to end on a bending capsule: the run folder, resumption, and what is never overwritten unasked."""
+"""`snarf train` end to end on a bending capsule: the run folder, resuming, and protection of existing runs."""
 
 from __future__ import annotations
 

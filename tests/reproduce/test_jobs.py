@@ -1,4 +1,4 @@
-"""One run of a plan with commands that are played: what is done once, what is done again, and what is written about it."""
+"""One run of a plan with fake commands: which stages run, which are repeated, and the recorded status."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from snarfcli.reproduce.results import collect
 
 
 class Player:
-    """Plays `snarf`: writes the files that its commands write, and fails or stops where it is told to."""
+    """Replaces `snarf`: writes the files that its commands write, and fails or stops at given stages."""
 
     def __init__(self, job, **codes: int) -> None:
         self.job, self.codes, self.calls = job, codes, []

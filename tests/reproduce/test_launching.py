@@ -1,4 +1,4 @@
-"""Hydra's launchers: the jobs of a plan run through them, each on its own, and what becomes of them comes back."""
+"""Hydra's launchers run the jobs of a plan and return their status."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_launcher_brings_every_job_to_its_end(name, tmp_path, monkeypatch):
         pytest.skip(f"hydra-{name}-launcher is not installed")
     monkeypatch.chdir(tmp_path)
     jobs = fake_plan(tmp_path, systems=("snarf", "nasa")).jobs
-    for job in jobs:  # all is there already, so that only the way through the launcher is tested
+    for job in jobs:  # all results exist, so that only the launcher is tested
         fake_run(job, {"id": 0.9, "ood": 0.8})
     seen = []
     processes = 2 if name == "joblib" else 1
@@ -72,7 +72,7 @@ def test_ctrl_c_stops_jobs_and_waits_for_them(tmp_path, monkeypatch):
 @pytest.mark.parametrize("any_plugin", [True, False])
 def test_launchers_that_are_not_installed_name_what_to_install(monkeypatch, any_plugin):
     def find_spec(name):
-        if not any_plugin:  # as importlib does where even the package around the module is missing
+        if not any_plugin:  # as importlib does if the parent package is missing too
             raise ModuleNotFoundError(f"No module named {name.partition('.')[0]!r}")
 
     monkeypatch.setattr(importlib.util, "find_spec", find_spec)
@@ -96,7 +96,7 @@ def test_settings_reach_hydra(tmp_path):
     assert launching._slots(Launcher("joblib", 3)) is None
 
 
-def test_a_job_that_is_not_in_the_plan_is_refused(tmp_path):
+def test_a_job_that_is_not_in_the_plan_is_rejected(tmp_path):
     with pytest.raises(UserError, match="no plan at"):
         run_planned_job(tmp_path / "plan.json", 0)
     (tmp_path / "plan.json").write_text('{"jobs": [], "slots": null}')

@@ -1,4 +1,4 @@
-"""Plans: every row's settings are real, every run has a folder of its own, and what cannot be run is refused at once."""
+"""Plans: the settings of all rows exist, every run has a different folder, and wrong options are rejected before any work."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_every_row_of_every_experiment_has_settings_of_the_commands(name, tmp_pa
         for evaluation in job.evaluations:
             check_overrides(overrides_of(evaluation.arguments), EvalConfig, "eval")
     assert len({job.folder for job in plan.jobs}) == len(plan.jobs)
-    # in their settings rows differ, but for what the preset says anyway and what the samples are
+    # rows differ in their settings, except where the preset has the same value or only the samples differ
     seed0 = [job for job in plan.jobs if job.seed == 0 and job.subject == subjects[0]]
     same = {"fast_snarf-broyden", "grid32"}  # the coarse grid of quick
     assert len({job.digest for job in seed0}) == len(seed0) - (same <= {job.row for job in seed0})
@@ -129,7 +129,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("choice", "message"), WRONG)
-def test_a_choice_that_cannot_be_made_is_refused(choice, message, tmp_path):
+def test_a_choice_that_cannot_be_made_is_rejected(choice, message, tmp_path):
     with pytest.raises(UserError) as error:
         fake_plan(tmp_path, **choice)
     assert message in str(error.value)

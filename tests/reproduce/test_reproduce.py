@@ -1,4 +1,4 @@
-"""`snarf reproduce`: how it is called, and a whole table of a subject that is a bending capsule."""
+"""`snarf reproduce`: its arguments, and a whole table of a bending capsule."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_the_command_is_written_as_it_can_be_typed():
 
 
 def in_this_process(arguments, log, stopped):
-    """Run a command of a job without a process of its own, which would take seconds to start."""
+    """Run a command of a job in this process; a new one would take seconds to start."""
     if stopped():
         raise JobStopped
     Path(log).parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The figures of the 2D stick show what they are given."""
+"""The figures of the 2D stick show the given shapes and numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from snarfcli.sampling import SamplingSettings, in_turned_over, winding_numbers
 
 
 class TrueStick:
-    """A field that knows the meshes of a sequence, or calls everything outside."""
+    """A field with the exact occupancy of a sequence, or one that is empty."""
 
     def __init__(self, sequence, is_empty: bool = False) -> None:
         self.sequence, self.is_empty = sequence, is_empty
@@ -42,7 +42,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
 
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list:
-    """Figures as they are when they are saved."""
+    """The figures at the time of saving."""
     saved = []
     save = stick2d_figures._save
     monkeypatch.setattr(stick2d_figures, "_save", lambda figure, path: (saved.append(figure), save(figure, path)))
@@ -103,7 +103,7 @@ def test_curves_show_the_values(tmp_path: Path, figures: list) -> None:
     assert [text.get_text() for text in figures[0].legends[0].get_texts()] == ["forward", "backward"]
 
 
-def test_nothing_to_draw_is_refused(tmp_path: Path) -> None:
+def test_nothing_to_draw_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least one pose"):
         draw_shapes(tmp_path / "a.png", [])
     with pytest.raises(ValueError, match="at least one value"):

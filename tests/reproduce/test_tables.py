@@ -1,4 +1,4 @@
-"""Tables from made-up runs: means, deviations, what failed, links, and the same numbers in Markdown and CSV."""
+"""Tables of made-up runs: means, deviations, failed runs, links, and the same numbers in Markdown and CSV."""
 
 from __future__ import annotations
 

@@ -18,8 +18,8 @@ __all__ = ["locked", "one_of", "try_lock"]
 log = logging.getLogger(__name__)
 
 _LOOK_EVERY_S = 0.3
-# What file systems without locks answer, such as Lustre and NFS mounted without them.
-_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)
+# What file systems without locks answer, such as Lustre, NFS and shared folders mounted without them.
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
 
 
 @contextmanager

@@ -29,12 +29,6 @@ class BackgroundWorker:
         self._thread = threading.Thread(target=self._run, name="snarf-view-worker", daemon=True)
         self._thread.start()
 
-    @property
-    def is_idle(self) -> bool:
-        """Whether `start` would be accepted: no request is running, and the last outcome was taken."""
-        with self._changed:
-            return self._request is None and self._outcome is None
-
     def start(self, request: Any) -> bool:
         """Start a request; return False, and reject it, if the worker is busy."""
         with self._changed:

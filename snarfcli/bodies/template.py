@@ -11,11 +11,11 @@ __all__ = ["MeshTemplate"]
 
 @dataclass(frozen=True, eq=False)
 class MeshTemplate:
-    """Ground truth for evaluation, for pictures, and for the systems that use ground-truth skinning weights."""
+    """Ground-truth mesh and skinning weights, for evaluation, for pictures, and for systems that are trained with them."""
 
     vertices: NDArray
     """[V, 3], canonical frame, metres."""
     faces: NDArray
-    """[F, 3], vertex numbers, outward; [0, 3] where only the vertices are known."""
+    """[F, 3], vertex indices, with outward normals; [0, 3] if only the vertices are known."""
     weights: NDArray
-    """[V, J], skinning weights, rows sum to 1."""
+    """[V, J], skinning weights; each row sums to 1."""

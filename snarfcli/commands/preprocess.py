@@ -1,6 +1,6 @@
 """`snarf preprocess`: sample occupancy points from the posed meshes of a subject.
 
-Imports of the samplers stand inside `run`: they load PyTorch and the mesh libraries, which --help does not need.
+The samplers are imported inside `run`, because they load PyTorch and the mesh libraries, which --help does not need.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ class PreprocessConfig:
     body: str | None = MISSING
     """Body model file, or a folder with it (under its original file name); null searches below data_root."""
     points_per_frame: int = MISSING
-    """Number of points per frame, a multiple of 8: half uniform in the papers' box, half near the surface."""
+    """Number of points per frame, a multiple of 8: half uniform in the sampling cube, half near the surface."""
     surface_noise_m: float = MISSING
-    """Standard deviation of the near-surface points from the surface, along each axis, metres."""
+    """Standard deviation of the normal noise that moves points off the surface, along each axis, metres."""
     padding: float = MISSING
-    """Enlargement of the sampling cube, as a share of the longest side of the bounding box of the mesh."""
+    """Sampling cube: its side exceeds the longest side of the mesh's bounding box by this share of that side."""
     inside_test: str = MISSING
-    """winding: points in overlapping parts are inside; parity: they are outside, as in the papers' code."""
+    """Test for inside points: winding (points in overlapping parts are inside) or parity (outside, as in the papers' code)."""
     workers: int = MISSING
-    """Number of processes; 0: one per core."""
+    """Number of worker processes; 0 for one per core."""
     seed: int = MISSING
     """Seed of the random points; the samples do not depend on the number of workers."""
     overwrite: bool = MISSING
@@ -54,7 +54,7 @@ class PreprocessConfig:
 
 
 def run(config: PreprocessConfig) -> None:
-    """Sample one subject or all subjects; existing samples are kept.
+    """Sample one subject or all subjects; existing samples are kept, unless `overwrite` is set.
 
     Raises:
         UserError: a setting cannot be used, a subject or sequence is unknown, or existing samples have other settings.
@@ -66,7 +66,7 @@ def run(config: PreprocessConfig) -> None:
     from snarfcli.samples.preprocessing import preprocess_subject
     from snarfcli.sampling import SamplingSettings
 
-    source = find_dataset(config.data.name)
+    dataset = find_dataset(config.data.name)
     sampling = SamplingSettings(
         points_per_frame=config.points_per_frame,
         surface_noise_m=config.surface_noise_m,
@@ -74,20 +74,20 @@ def run(config: PreprocessConfig) -> None:
         inside_test=config.inside_test,
         seed=config.seed,
     )
-    steps = {
+    frame_steps = {
         "train": config.data.frame_step,
         "test": config.data.test_frame_step,
         "ood": config.data.ood_frame_step,
     }
-    for split, step in steps.items():
+    for split, step in frame_steps.items():
         if step < 1:
             raise UserError(f"data: wanted a frame step of at least 1 for {split} sequences, got {step}")
     if config.workers < 0:
         raise UserError(f"workers: wanted a number of processes, or 0 for one per core, got {config.workers}")
     workers = config.workers or count_cores()
     request = DataRequest(config.data, Path(config.data_root), config.body)
-    for subject in source.subjects(request) if config.subject == "all" else [config.subject]:
-        data = source.load(subject, request)
+    for subject in dataset.subjects(request) if config.subject == "all" else [config.subject]:
+        data = dataset.load(subject, request)
         log.info("subject %s of %s data, %d processes", data.subject, data.data, workers)
         for line in data.sources:
             log.info("from %s", line)
@@ -95,7 +95,7 @@ def run(config: PreprocessConfig) -> None:
             data,
             config.data_root,
             sampling,
-            steps,
+            frame_steps,
             workers=workers,
             overwrite=config.overwrite,
             sequences=config.sequences,

@@ -1,20 +1,31 @@
 """Subjects that users provide: posed meshes with a skeleton and poses, or rigged files.
 
-A subject is in `<data_root>/meshes`, or in the folder `data.folder`, in one of three forms:
+A subject is in `<data_root>/meshes`, or in the folder `data.folder`, in one of four forms.
 
-    fox.glb                     a rigged file (glTF) with skeleton, skin and animations; each animation is a sequence
-    fox/*.glb                   several rigged files of one skeleton: the mesh of the first that has one, the animations of all
+One rigged file (glTF) with skeleton, skin and animations, each of which is a sequence:
+
+    fox.glb
+
+Several rigged files with one skeleton; the mesh is that of the first file that has one, the animations are those of all files:
+
+    fox/*.glb
+
+A skeleton and one folder per sequence:
 
     fox/skeleton.json           a skeleton: names, parents, joints_rest (see skeleton_files); or skeleton.npz, or skeleton.bvh
     fox/<sequence>/poses.npz    poses or bone transforms, one per frame; or poses.json, or motion.bvh
     fox/<sequence>/*.obj        the posed meshes, one file per frame in the order of their names (.ply, .off, .stl, .glb, ...)
 
-    fox/skeleton.json ...       poses and meshes beside the skeleton: one sequence
+A single sequence, whose poses and meshes are in the same folder as the skeleton:
 
-Without a skeleton file, the skeleton is that of a sequence's motion.bvh. The numbers of vertices and faces may differ between
-frames. Held-out sequences are listed, by name or pattern, in `fox/split.json`, or in data.test and data.ood. Otherwise, names
-that start with `ood` are out of distribution and the last fifth of the other sequences (at least one) is for testing; if there
-is only one sequence, the last fifth of its frames.
+    fox/skeleton.json, fox/poses.npz, fox/*.obj
+
+If there is no skeleton file, the skeleton is read from the motion.bvh of a sequence. The numbers of vertices and faces may
+differ between frames.
+
+Held-out sequences are listed, by name or pattern, in `fox/split.json`, or in data.test and data.ood. Otherwise, sequences whose
+names start with `ood` are out of distribution, and the last fifth of the others (at least one) is for testing. If there is only
+one sequence, the last fifth of its frames is for testing.
 """
 
 from __future__ import annotations
@@ -59,11 +70,11 @@ from snarfcli.names import folder_names
 
 __all__ = ["load", "subjects"]
 
-_SCALES = (1e-6, 1e6)  # metres per unit, from micrometres to 1000 km
+_SCALE_LIMITS = (1e-6, 1e6)  # metres per unit, from micrometres to 1000 km
 
 
 def subjects(request: DataRequest) -> tuple[str, ...]:
-    """Return the names of the subjects in the folder.
+    """Return the names of all subjects.
 
     Raises:
         UserError: the folder does not exist or has no subject.
@@ -84,7 +95,7 @@ def load(subject: str, request: DataRequest) -> SubjectData:
             listed in `broken` instead, unless there are no others.
     """
     config = request.config
-    _check(config)
+    _check_settings(config)
     place = find_subject(subject, request)
     rigged = rigged_files(place)
     if rigged:
@@ -92,8 +103,9 @@ def load(subject: str, request: DataRequest) -> SubjectData:
     return _load_meshes(subject, place, config)
 
 
-# ---------------------------------------------------------------- meshes in files
+# ---------------------------------------------------------------- one mesh file per frame
 def _load_meshes(subject: str, folder: Path, config: DataConfig) -> SubjectData:
+    """Read a subject that has a skeleton and one mesh file per frame."""
     sequences = [path for path in subfolders(folder) if list_surfaces(path) or files_with(path, POSE_SUFFIXES)]
     sequences = sequences or [folder]
     source, skeleton = _read_skeleton(folder, sequences)
@@ -109,7 +121,7 @@ def _load_meshes(subject: str, folder: Path, config: DataConfig) -> SubjectData:
         raise UserError(broken[0][1] + more)
     scale, why = person_scale(_first_mesh(recordings), config.scale, skeleton.scale)
     up = config.up if config.up != "auto" else skeleton.up or "y"
-    sources = (f"skeleton {source}, {len(skeleton.names)} joints", _world_text(why, up))
+    sources = (f"skeleton {source}, {len(skeleton.names)} joints", _conversion_text(why, up))
     return _subject(subject, skeleton, FileToWorld(scale, up), recordings, folder, config, sources, broken=tuple(broken))
 
 
@@ -125,6 +137,7 @@ def _read_skeleton(folder: Path, sequences: list[Path]) -> tuple[Path, SkeletonF
 
 
 def _read_recording(name: str, folder: Path, skeleton: SkeletonFile) -> RecordedSequence:
+    """Read the poses of one sequence, and list its mesh files, which are not read yet."""
     path = pose_file(folder)
     poses = bvh_poses(path, skeleton) if path.suffix.lower() == ".bvh" else read_poses(path, skeleton.order)
     meshes = list_surfaces(folder)
@@ -135,7 +148,10 @@ def _read_recording(name: str, folder: Path, skeleton: SkeletonFile) -> Recorded
 
 
 def _first_mesh(recordings: list[RecordedSequence]) -> NDArray:
-    """Return the vertices of the first mesh that can be read; they give the size of the subject."""
+    """Return the vertices [V, 3], units of the file, of the first frame of a sequence, for the size of the subject.
+
+    Sequences are tried in order until one has a first mesh that can be read.
+    """
     problem = None
     for recording in recordings:
         try:
@@ -149,38 +165,39 @@ def _first_mesh(recordings: list[RecordedSequence]) -> NDArray:
 
 # ---------------------------------------------------------------- rigged files
 def _load_rigged(subject: str, place: Path, paths: list[Path], config: DataConfig) -> SubjectData:
+    """Read a subject from rigged files; `place` is the file, or the folder with the files."""
     rigged = read_rigged_files(paths)
     if not rigged.clips:
-        raise UserError(f"{place} has no animation, which an avatar is learned from; export it with its animations")
+        raise UserError(f"{place} has no animations, but an avatar is learned from them; export the file with its animations")
     skeleton, mesh = rigged.skeleton, rigged.mesh
     scale, why = person_scale(mesh.vertices, config.scale, None)
-    up = config.up if config.up != "auto" else "y"  # as the format requires
+    up = config.up if config.up != "auto" else "y"  # glTF files have y up
     world = FileToWorld(scale, up)
     vertices = world.points(mesh.vertices)
     names = folder_names(name for name, _ in rigged.clips)
     recordings = []
     for name, (_, poses) in sorted(zip(names, rigged.clips, strict=True), key=lambda pair: pair[0]):
-        assert poses.posed_from_rest is not None  # clips of rigs have bone transforms
+        assert poses.posed_from_rest is not None  # rigged files always give bone transforms
         transforms = world.transforms(poses.posed_from_rest)
         recordings.append(RecordedSequence(name, poses, RigMeshes(vertices, mesh.faces, mesh.weights, transforms)))
-    files = f"{place}" if len(paths) == 1 else f"{len(paths)} files in {place}"
+    files = str(place) if len(paths) == 1 else f"{len(paths)} files in {place}"
     sources = [f"rigged file {files}: {len(skeleton.names)} joints, {len(mesh.vertices)} vertices, {len(recordings)} motions"]
     if rigged.dropped:
         some = ", ".join(rigged.dropped[:4]) + (", ..." if len(rigged.dropped) > 4 else "")
         sources.append(f"{len(rigged.dropped)} end joints that move no vertex were left out ({some})")
-    sources.append(_world_text(why, up))
-    make = partial(_template, vertices, mesh.faces, mesh.weights)
-    return _subject(subject, skeleton, world, recordings, place, config, tuple(sources), template=make)
+    sources.append(_conversion_text(why, up))
+    template = partial(_template, vertices, mesh.faces, mesh.weights)
+    return _subject(subject, skeleton, world, recordings, place, config, tuple(sources), template=template)
 
 
 def _template(vertices: NDArray, faces: NDArray, weights: NDArray, skeleton: Skeleton) -> MeshTemplate:
-    """Return the rigged mesh in the canonical pose."""
-    moved = skeleton.posed_from_rest(skeleton.canonical_pose[None]).numpy()
-    canonical, _ = RigMeshes(vertices, faces, weights, moved)[0]
+    """Return the mesh of a rig, given in the rest pose, in the canonical pose."""
+    canonical_from_rest = skeleton.posed_from_rest(skeleton.canonical_pose[None]).numpy()
+    canonical, _ = RigMeshes(vertices, faces, weights, canonical_from_rest)[0]
     return MeshTemplate(canonical, faces.astype(np.int32), weights)
 
 
-# ---------------------------------------------------------------- both
+# ---------------------------------------------------------------- all forms
 def _subject(
     subject: str,
     skeleton_file: SkeletonFile,
@@ -193,30 +210,43 @@ def _subject(
     template: Callable[[Skeleton], MeshTemplate] | None = None,
     broken: tuple[tuple[str, str], ...] = (),
 ) -> SubjectData:
-    """Choose the splits of the sequences, and convert skeleton and sequences to metres and y up."""
+    """Put a subject together: choose the splits of its sequences, and convert everything to metres and y up.
+
+    Args:
+        subject: name of the subject.
+        skeleton_file: skeleton in the units and axes of the files.
+        world: conversion from these units and axes.
+        recordings: sequences that can be used.
+        place: file or folder of the subject.
+        config: settings.
+        sources: lines about the origin of the data.
+        template: makes the mesh in the canonical pose from the converted skeleton; None if there is no such mesh.
+        broken: name of each sequence that cannot be used, and the reason.
+    """
     skeleton = _world_skeleton(skeleton_file, world, config.canonical)
     test, ood = _patterns(place, config)
     names = sorted([*(recording.name for recording in recordings), *(name for name, _ in broken)])
     if len(names) == 1 and not test:
         recordings = recordings[0].split_off_test()
         splits: dict[str, Split] = {recording.name: "test" if index else "train" for index, recording in enumerate(recordings)}
-    else:  # broken sequences count, so that repairing them does not change the split of the others
+    else:  # with the broken sequences, so that repairing their files does not change the split of the others
         splits = split_sequences(names, test, ood)
     specs = {recording.name: recording.to_sequence(splits[recording.name], skeleton, world) for recording in recordings}
     stretched = [name for name, spec in specs.items() if spec.posed_from_rest is not None]
     if stretched:
         sources += (f"joints stretch, scale or come apart in {', '.join(stretched[:6])}: bone transforms are kept as given",)
     ordered = sorted(specs.values(), key=lambda spec: SPLITS.index(spec.split))
-    made = template(skeleton) if template is not None else None
-    return SubjectData("meshes", subject, skeleton, tuple(ordered), made, sources=sources, broken=broken)
+    mesh = template(skeleton) if template is not None else None
+    return SubjectData("meshes", subject, skeleton, tuple(ordered), mesh, sources=sources, broken=broken)
 
 
 def _world_skeleton(file: SkeletonFile, world: FileToWorld, canonical: str) -> Skeleton:
+    """Return the skeleton in metres and y up; `canonical` is the setting data.canonical."""
     rest = torch.from_numpy(world.points(file.joints_rest))
     pose = torch.zeros_like(rest)
     if canonical == "legs_apart":
         if not {"l_hip", "r_hip"} <= set(file.names):
-            raise UserError("data.canonical=legs_apart: wanted joints named l_hip and r_hip, got none; give rest")
+            raise UserError("data.canonical=legs_apart: wanted joints named l_hip and r_hip, got at most one of them; use rest")
         pose = legs_apart_pose(file.names, torch.float64)
     elif canonical == "auto" and file.canonical_pose is not None:
         pose = torch.from_numpy(world.angles(file.canonical_pose))
@@ -224,9 +254,12 @@ def _world_skeleton(file: SkeletonFile, world: FileToWorld, canonical: str) -> S
 
 
 def _patterns(place: Path, config: DataConfig) -> tuple[list[str], list[str]]:
-    """Return the patterns of held-out and of out-of-distribution sequences from the settings, or else from `split.json`."""
-    path = (place if place.is_dir() else place.parent) / "split.json"
-    content = read_json(path, "split") if path.is_file() and place.is_dir() else {}
+    """Return the patterns of test and of out-of-distribution sequences from the settings, or else from `split.json`.
+
+    A list `train` in the file is allowed, but not used: all other sequences are for training.
+    """
+    path = place / "split.json"  # does not exist if `place` is a file
+    content = read_json(path, "split") if path.is_file() else {}
     if not isinstance(content, dict) or not set(content) <= {"test", "ood", "train"}:
         raise UserError(
             f'split {path}: wanted an object such as {{"test": ["walk"], "ood": ["jump*"]}}, got another; repair it'
@@ -237,11 +270,12 @@ def _patterns(place: Path, config: DataConfig) -> tuple[list[str], list[str]]:
     return config.test or content.get("test", []), config.ood or content.get("ood", [])
 
 
-def _world_text(why: str, up: str) -> str:
+def _conversion_text(why: str, up: str) -> str:
+    """Return a line about the conversion of the files; `why` is the reason for the scale, `up` the up axis of the files."""
     return why + ("" if up == "y" else f"; rotated from {up} up to y up")
 
 
-def _check(config: DataConfig) -> None:
+def _check_settings(config: DataConfig) -> None:
     check_choice("data.up", config.up, ("auto", "y", "z"))
     check_choice("data.canonical", config.canonical, ("auto", "rest", "legs_apart"))
     if config.scale != "auto":
@@ -249,6 +283,6 @@ def _check(config: DataConfig) -> None:
             scale = float(config.scale)
         except ValueError:
             scale = math.nan
-        if not _SCALES[0] <= scale <= _SCALES[1]:
-            limits = f"from {_SCALES[0]:g} to {_SCALES[1]:g}"
+        if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
+            limits = f"from {_SCALE_LIMITS[0]:g} to {_SCALE_LIMITS[1]:g}"
             raise UserError(f"data.scale: wanted auto or metres per unit {limits}, got '{config.scale}'")

@@ -1,7 +1,7 @@
 """Sources of the posed meshes of a sequence: arrays, a body model, a rig, or files.
 
-Worker processes unpickle the result of `chosen` and import this file for it. It does not import PyTorch, whose import takes
-longer than sampling ten frames, so that they start in 0.4 s.
+Worker processes unpickle the result of `chosen`, for which they import this module. The module does not import PyTorch at the
+top, because that takes longer than sampling ten frames. Without it, a worker process starts in 0.4 s.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ if TYPE_CHECKING:
 __all__ = ["ArrayMeshes", "BodyMeshes", "FileMeshes", "PosedMeshes", "RigMeshes"]
 
 Mesh = tuple[NDArray, NDArray]
+"""Vertices [V, 3], metres, and faces [F, 3], vertex indices, with outward normals."""
 
 
 class PosedMeshes(Protocol):
-    """The posed meshes of one sequence by frame: vertices [V, 3], metres, and outward faces [F, 3].
+    """The posed meshes of one sequence, indexed by frame.
 
-    The main process calls `chosen` and sends the result to a worker process, which reads the meshes. The result must be
-    picklable, and small or fast to compute.
+    The main process calls `chosen` and sends the result to a worker process, which reads the meshes from it. So the result must
+    be picklable and fast to compute.
     """
 
     def __len__(self) -> int: ...
@@ -37,7 +38,7 @@ class PosedMeshes(Protocol):
     def __getitem__(self, index: int) -> Mesh: ...
 
     def chosen(self, frames: NDArray[np.int64]) -> PosedMeshes:
-        """Return the meshes of some frames."""
+        """Return the meshes of the frames with these indices [K], in this order."""
         ...
 
     def source(self, index: int) -> str:
@@ -51,12 +52,12 @@ class PosedMeshes(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ArrayMeshes:
-    """Meshes of one topology in memory."""
+    """Meshes in memory that all have the same faces."""
 
     vertices: NDArray
     """[T, V, 3], metres."""
     faces: NDArray
-    """[F, 3], vertex numbers, outward."""
+    """[F, 3], vertex indices, with outward normals."""
 
     def __len__(self) -> int:
         return len(self.vertices)
@@ -75,11 +76,11 @@ class ArrayMeshes:
 
 
 class BodyMeshes:
-    """A body model in the poses of a motion; posed when frames are chosen.
+    """A body model in the poses of a motion. `chosen` computes the meshes.
 
     Args:
         body: the model.
-        betas: [S'], shape parameters.
+        betas: [S], shape parameters.
         poses: [T, J, 3], axis-angle, radians.
         translation: [T, 3], metres.
     """
@@ -94,7 +95,7 @@ class BodyMeshes:
         return self.chosen(np.array([index]))[0]
 
     def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
-        import torch  # here, since worker processes start without it
+        import torch  # not at the top, since worker processes do not need it
 
         body = self.body.to(torch.float64)
         pose, translation = torch.from_numpy(self.poses[frames]), torch.from_numpy(self.translation[frames])
@@ -112,14 +113,14 @@ class BodyMeshes:
 
 @dataclass(frozen=True, eq=False)
 class RigMeshes:
-    """A rigged mesh, posed by linear blend skinning when frames are chosen."""
+    """A rigged mesh. `chosen` poses it by linear blend skinning."""
 
     vertices: NDArray
     """[V, 3], vertices in the rest pose, metres."""
     faces: NDArray
-    """[F, 3], vertex numbers, outward."""
+    """[F, 3], vertex indices, with outward normals."""
     weights: NDArray
-    """[V, J], skinning weights, rows sum to 1."""
+    """[V, J], skinning weights; each row sums to 1."""
     posed_from_rest: NDArray
     """[T, J, 4, 4], bone transforms, metres."""
 
@@ -130,7 +131,7 @@ class RigMeshes:
         return self.chosen(np.array([index]))[0]
 
     def chosen(self, frames: NDArray[np.int64]) -> ArrayMeshes:
-        from snarfcli.bodies.skinning import skin_vertices  # here, since the room `bodies` imports PyTorch
+        from snarfcli.bodies.skinning import skin_vertices  # not at the top: the package `bodies` imports PyTorch
 
         posed = skin_vertices(self.vertices, self.weights, self.posed_from_rest[frames])
         return ArrayMeshes(posed.astype(np.float32), self.faces.astype(np.int32))
@@ -147,11 +148,11 @@ class FileMeshes:
     """One mesh file per frame, read when a mesh is requested."""
 
     paths: Sequence[Path]
-    """T files."""
+    """[T], one file per frame."""
     read: Callable[[Path], Mesh]
     """A module-level function that reads one file."""
     world_from_file: NDArray
-    """[4, 4], rotation and scale from the vertices of a file to metres and y up."""
+    """[4, 4], transform from the units and axes of the files to metres and y up."""
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -167,7 +168,7 @@ class FileMeshes:
         return str(self.paths[index])
 
     def fingerprint(self) -> str:
-        # Names and contents, not times, so that a copy of a data set counts as equal. Sizes are not enough: a binary mesh keeps
-        # its size when vertices change.
+        # From names and contents, not modification times, so that a copy of a data set has the same fingerprint. Sizes would
+        # not be enough: the size of a binary mesh file stays the same when vertices change.
         contents = "\n".join(f"{path.name} {file_digest(path)}" for path in self.paths)
         return hashlib.sha256(contents.encode()).hexdigest()[:16]

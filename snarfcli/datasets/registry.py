@@ -13,17 +13,21 @@ __all__ = ["DataSet", "find_dataset"]
 
 
 class DataSet(Protocol):
-    """Interface of a module that reads one data set."""
+    """Interface that each module for one data set implements."""
 
     def subjects(self, request: DataRequest) -> tuple[str, ...]:
-        """Return the ids of the available subjects."""
+        """Return the ids of the available subjects.
+
+        Raises:
+            UserError: the folder of the data set is missing, or has no subject.
+        """
         ...
 
     def load(self, subject: str, request: DataRequest) -> SubjectData:
-        """Return one subject.
+        """Return the data of one subject.
 
         Raises:
-            UserError: it is missing or cannot be used.
+            UserError: the subject is missing or cannot be used.
         """
         ...
 
@@ -40,7 +44,7 @@ _DATASETS: dict[str, DataSet] = {
 
 
 def find_dataset(name: str) -> DataSet:
-    """Return the module that reads the data set of a name.
+    """Return the module that reads the data set with this name.
 
     Raises:
         UserError: there is no such data set.

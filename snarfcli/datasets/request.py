@@ -1,4 +1,4 @@
-"""A request to a data set: settings and folders."""
+"""The settings and folders with which a data set is loaded."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ __all__ = ["DataRequest"]
 
 @dataclass(frozen=True)
 class DataRequest:
-    """What to load, and from where."""
+    """Which data to load, and from which folders."""
 
     config: DataConfig
     """Settings of the data set."""
     data_root: Path
-    """The data folder."""
+    """Folder with the data of all data sets."""
     body: str | None = None
-    """File or folder of the body model; None: below `data_root`, or the body of the data set."""
+    """File or folder of the body model; None searches below `data_root`, or uses the body that the data set includes."""
 
     @property
     def folder(self) -> Path:
-        """Folder with the files of the data set."""
+        """Folder in which to look for the files of the data set: the setting `data.folder`, or else `data_root`."""
         return Path(self.config.folder).expanduser() if self.config.folder is not None else self.data_root

@@ -30,10 +30,10 @@ class DataConfig:
     ood: list[str] = field(default_factory=list)
     """Names or patterns of out-of-distribution sequences; empty for those of the data set (cape, meshes)."""
     hands: str = "rest"
-    """SMPL's two hand joints from SMPL-H poses: rest (zero), or released (columns 66 to 72, as in the papers' code)."""
+    """SMPL's hand joints for files with SMPL-H poses: rest (zero), or released (columns 66 to 72, as in the papers' code)."""
     scale: str = "auto"
-    """Metres per unit of the files, for meshes; auto is 1 for a subject of a person's size, else scales it to that size."""
+    """Metres per unit of the files, for meshes; auto: 1 for a subject of a person's size, else what gives it that size."""
     up: str = "auto"
     """Up axis of the files, for meshes: auto, y or z."""
     canonical: str = "auto"
-    """Canonical pose, for meshes: rest, legs_apart (SNARF's, for a T-pose at rest), or auto: the skeleton file's, else rest."""
+    """Canonical pose, for meshes: rest; legs_apart (SNARF's, if rest is a T-pose); auto (from the skeleton file, else rest)."""

@@ -1,7 +1,7 @@
 """The two-dimensional stick of SNARF Sec. 4.1 and 4.3: two bones in the plane z = 0, with or without a rigid object.
 
-The papers give the weights (inverse distances to the bones) and the angles, but not the sizes, the object and the number of
-poses.
+The paper gives the weights (inverse distances to the bones) and the angles. The sizes, the object and the number of poses are
+chosen here.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from snarfcli.motions import Motion
 __all__ = ["STICK_STEPS_DEG", "STICK_SUBJECTS", "load", "stick_subject", "stick_weights", "subjects"]
 
 STICK_STEPS_DEG = {"stick_step10": 10, "stick_step20": 20, "stick_step30": 30, "stick_step60": 60}
-"""Subjects for interpolation, and the step of the lattice of their training angles, degrees."""
+"""Subjects for interpolation. Their training angles form a regular lattice; the value is its step, degrees."""
 
 STICK_SUBJECTS = ("stick", "stick_object", *STICK_STEPS_DEG)
 """`stick`, `stick_object` (with a rigid object that the stick reaches) and the subjects for interpolation."""
 
-_HALF_WIDTH_M, _HALF_LENGTH_M = 0.15, 0.8  # the size of a person, for which the settings of training are made
-_REACH_M = 0.7  # from the middle joint to each end of the bones, which are inside the stick
-_CELLS = (24, 128)  # quadrilaterals across and along: sides of 12.5 mm, an even number across for a column on the bones
-_HALF_HEIGHT_M = 0.02  # of the prism; thin, so that the nodes of the weight grid lie in the plane
+_HALF_WIDTH_M, _HALF_LENGTH_M = 0.15, 0.8  # of the stick: a person's size, as the training settings expect
+_REACH_M = 0.7  # length of each bone; they meet at the middle joint and end inside the stick
+_CELLS = (24, 128)  # quadrilaterals across and along, 12.5 mm each; even across, so that a column of vertices is on the bones
+_HALF_HEIGHT_M = 0.02  # of the prism along z; thin, so that the nodes of the weight grid lie in the plane z = 0
 _OBJECT_AT_M, _OBJECT_RADIUS_M, _OBJECT_SIDES, _OBJECT_RINGS = (0.5, -0.4), 0.2, 96, 8
-_NEAREST_M = 1e-9  # a point on a bone gets weight 1 of that bone
+_MIN_DISTANCE_M = 1e-9  # to a bone, against division by zero; a point on one bone gets weight 1 for it
 
-_TRAINED_DEG, _FARTHEST_DEG = 60.0, 120.0  # SNARF Sec. 4.3
-_TRAIN_FRAMES, _TEST_FRAMES = 120, 60
+_TRAINED_DEG, _FARTHEST_DEG = 60.0, 120.0  # largest angle of a joint in training and out of distribution, SNARF Sec. 4.3
+_TRAIN_FRAMES, _TEST_FRAMES = 120, 60  # number of frames; as many out of distribution as for testing
 _FRAME_RATE = 30.0  # arbitrary, since the frames have no order in time
-_LOWER, _UPPER = 1, 2
+_LOWER, _UPPER, _OBJECT = 1, 2, 4  # indices of joints
 
 
 def subjects(request: DataRequest) -> tuple[str, ...]:
-    """Return the names of the sticks."""
+    """Return the names of the sticks, `STICK_SUBJECTS`."""
     return STICK_SUBJECTS
 
 
@@ -70,13 +70,13 @@ def stick_subject(subject: str) -> SubjectData:
         raise UserError(f"no stick '{subject}'{nearest(subject, STICK_SUBJECTS)}; wanted one of {', '.join(STICK_SUBJECTS)}")
     has_object = subject == "stick_object"
     skeleton = _skeleton(has_object)
-    outlines = [_strip(), *([_disk()] if has_object else [])]
-    template = _prisms(outlines, skeleton.num_joints)
-    generator = np.random.default_rng(6021)  # the poses of `stick` are those of `stick_object`
+    shapes = [_strip(), *([_disk()] if has_object else [])]
+    template = _prisms(shapes, skeleton.num_joints)
+    generator = np.random.default_rng(6021)  # the same seed for all, so that `stick` and `stick_object` have the same poses
     angles: dict[Split, NDArray[np.float64]] = {
         "train": _training_angles(STICK_STEPS_DEG.get(subject), generator),
-        "test": _inside(_TEST_FRAMES, generator),
-        "ood": _outside(_TEST_FRAMES, generator),
+        "test": _angles_in_range(_TEST_FRAMES, generator),
+        "ood": _angles_beyond_range(_TEST_FRAMES, generator),
     }
     names: dict[Split, str] = {"train": "bend", "test": "bend_anew", "ood": "bend_further"}
     sequences = tuple(_sequence(names[split], split, values, skeleton, template) for split, values in angles.items())
@@ -97,7 +97,7 @@ def stick_weights(points: NDArray) -> NDArray[np.float64]:
     """
     lower, middle, upper = (np.array([0.0, y]) for y in (-_REACH_M, 0.0, _REACH_M))
     distances = [_distance(np.asarray(points, np.float64), *ends) for ends in ((lower, middle), (middle, upper))]
-    inverse = 1.0 / np.maximum(np.stack(distances, -1), _NEAREST_M)
+    inverse = 1.0 / np.maximum(np.stack(distances, -1), _MIN_DISTANCE_M)
     return inverse / inverse.sum(-1, keepdims=True)
 
 
@@ -109,6 +109,7 @@ def _distance(points: NDArray, start: NDArray, end: NDArray) -> NDArray:
 
 
 def _skeleton(has_object: bool) -> Skeleton:
+    """Return the joints that `stick_subject` describes; the canonical pose is the rest pose."""
     names, parents = ["root", "lower", "upper", "tip"], [-1, 0, 1, 2]
     joints = [[0.0, -_REACH_M, 0.0], [0.0, -_REACH_M, 0.0], [0.0, 0.0, 0.0], [0.0, _REACH_M, 0.0]]
     if has_object:
@@ -117,8 +118,8 @@ def _skeleton(has_object: bool) -> Skeleton:
     return Skeleton(tuple(names), tuple(parents), rest, torch.zeros_like(rest))
 
 
-# A flat shape: points [V, 2], counterclockwise triangles [F, 3], indices of the points along its outline counterclockwise,
-# weights [V, K], and the indices of the K joints.
+# A flat shape: points [V, 2], metres; counterclockwise triangles [F, 3]; indices of the points on its outline,
+# counterclockwise; weights [V, K]; and the indices of the K joints that move it.
 _Flat = tuple[NDArray, NDArray, NDArray, NDArray, list[int]]
 
 
@@ -135,7 +136,7 @@ def _strip() -> _Flat:
 
 
 def _disk() -> _Flat:
-    """Return the object: a disk of rings around its centre."""
+    """Return the object: a disk, made of rings of quadrilaterals around a fan of triangles."""
     turn = 2 * np.pi * np.arange(_OBJECT_SIDES) / _OBJECT_SIDES
     circle = np.stack([np.cos(turn), np.sin(turn)], -1)
     radii = _OBJECT_RADIUS_M * np.arange(1, _OBJECT_RINGS + 1) / _OBJECT_RINGS
@@ -145,11 +146,14 @@ def _disk() -> _Flat:
     a, b, c, d = number[:-1], number[1:], following[1:], following[:-1]
     middle = np.stack([np.zeros_like(number[0]), number[0], following[0]], -1)
     rings = [np.stack(corners, -1).reshape(-1, 3) for corners in ((a, b, c), (a, c, d))]
-    return points, np.concatenate([middle, *rings]), number[-1], np.ones((len(points), 1)), [4]
+    return points, np.concatenate([middle, *rings]), number[-1], np.ones((len(points), 1)), [_OBJECT]
 
 
 def _prisms(shapes: list[_Flat], num_joints: int) -> MeshTemplate:
-    """Return flat shapes as closed prisms around z = 0; walls have two rows, so that there are vertices at z = 0."""
+    """Return flat shapes as closed prisms along z, centred at z = 0.
+
+    Their walls have two rows of quadrilaterals, so that the middle vertices are at z = 0.
+    """
     vertices, faces, weights, count = [], [], [], 0
     for points, triangles, outline, own_weights, joints in shapes:
         flat = len(points)
@@ -161,34 +165,42 @@ def _prisms(shapes: list[_Flat], num_joints: int) -> MeshTemplate:
             a, b, c, d = low, np.roll(low, -1), np.roll(high, -1), high
             walls += [np.stack([a, b, c], -1), np.stack([a, c, d], -1)]
         faces.append(count + np.concatenate([triangles[:, ::-1], flat + triangles, *walls]))
-        every = np.zeros((2 * flat + len(outline), num_joints))
-        every[:, joints] = np.concatenate([own_weights, own_weights, own_weights[outline]])
-        weights.append(every)
-        count += len(every)
+        all_weights = np.zeros((2 * flat + len(outline), num_joints))
+        all_weights[:, joints] = np.concatenate([own_weights, own_weights, own_weights[outline]])
+        weights.append(all_weights)
+        count += len(all_weights)
     return MeshTemplate(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.concatenate(weights))
 
 
-def _inside(count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Return random angles [count, 2] of the two joints in the range of training, degrees."""
+def _angles_in_range(count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+    """Return random angles [count, 2] of the two joints within the range of training, degrees."""
     return generator.uniform(-_TRAINED_DEG, _TRAINED_DEG, (count, 2))
 
 
-def _outside(count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Return random angles [count, 2] of the two joints, all beyond the range of training, degrees."""
+def _angles_beyond_range(count: int, generator: np.random.Generator) -> NDArray[np.float64]:
+    """Return random angles [count, 2] of the two joints, each beyond the range of training, degrees."""
     return generator.uniform(_TRAINED_DEG, _FARTHEST_DEG, (count, 2)) * generator.choice([-1.0, 1.0], (count, 2))
 
 
 def _training_angles(step_deg: int | None, generator: np.random.Generator) -> NDArray[np.float64]:
-    """Return the training angles [T, 2], degrees: random or a lattice, followed by a ninth as many for validation."""
+    """Return the angles [T, 2] of the training sequence, degrees.
+
+    Its last tenth, which is for validation, is always random.
+
+    Args:
+        step_deg: step of a lattice of angles; None for random angles.
+        generator: source of the random numbers.
+    """
     if step_deg is None:
-        trained = _inside(_TRAIN_FRAMES, generator)
+        trained = _angles_in_range(_TRAIN_FRAMES, generator)
     else:
         values = np.arange(-_TRAINED_DEG, _TRAINED_DEG + 1, step_deg)
         trained = generator.permutation(np.stack(np.meshgrid(values, values), -1).reshape(-1, 2))
-    return np.concatenate([trained, _inside(max(1, round(len(trained) / 9)), generator)])
+    return np.concatenate([trained, _angles_in_range(max(1, round(len(trained) / 9)), generator)])
 
 
 def _sequence(name: str, split: Split, angles: NDArray[np.float64], skeleton: Skeleton, template: MeshTemplate) -> SequenceSpec:
+    """Return a sequence with the joint angles [T, 2], degrees, about z."""
     poses = np.zeros((len(angles), skeleton.num_joints, 3))
     poses[:, [_LOWER, _UPPER], 2] = np.deg2rad(angles)
     motion = Motion(name, poses, np.zeros((len(angles), 3)), _FRAME_RATE)

@@ -1,4 +1,4 @@
-"""The data of a subject: skeleton, sequences and posed meshes."""
+"""The data of one subject: its skeleton and its sequences of posed meshes."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class SequenceSpec:
     meshes: PosedMeshes
     """The posed mesh of every frame of the motion."""
     posed_from_rest: NDArray[np.float64] | None = None
-    """[T, J, 4, 4], bone transforms, metres, if the poses do not reproduce them (joints that move or stretch)."""
+    """[T, J, 4, 4], bone transforms, metres; None if they follow from `motion`, that is, if no joint moves or stretches."""
     frames: NDArray[np.int64] | None = None
-    """[K], indices of the frames to use if the data set chooses them; None for the frame step of the settings."""
+    """[K], indices of the frames to use, if the data set chooses them; None to use every n-th frame, as in the settings."""
 
 
 @dataclass(frozen=True, eq=False)
 class SubjectData:
-    """A subject: a skeleton and posed meshes in sequences."""
+    """A subject: a skeleton and sequences of posed meshes."""
 
     data: str
     """Name of the data set."""
@@ -47,15 +47,15 @@ class SubjectData:
     sequences: tuple[SequenceSpec, ...]
     """Training, test and out-of-distribution sequences, in this order."""
     template: MeshTemplate | None = None
-    """Mesh of the subject in the canonical pose; None if the data set has none."""
+    """Mesh of the subject in the canonical pose, with skinning weights; None if the data set has none."""
     betas: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     """[S], shape parameters of the body model; S is 0 without a body model."""
     sources: tuple[str, ...] = ()
     """Origin of the data, such as the file of the body; printed, and written to the manifest."""
     broken: tuple[tuple[str, str], ...] = ()
-    """Name and reason of each sequence that cannot be used."""
+    """Name of each sequence that cannot be used, and the reason."""
     is_planar: bool = False
-    """Whether it is two-dimensional: its meshes are prisms along z, and only the plane z = 0 is sampled."""
+    """Whether the subject is two-dimensional: its meshes are prisms along z, and only the plane z = 0 is sampled."""
 
     def of_split(self, split: Split) -> tuple[SequenceSpec, ...]:
         """Return the sequences of one split."""
@@ -63,12 +63,18 @@ class SubjectData:
 
 
 def body_template(body: Body, betas: NDArray[np.float64], skeleton: Skeleton) -> MeshTemplate:
-    """Return the mesh of a body model in the skeleton's canonical pose."""
+    """Return the mesh of a body model in the skeleton's canonical pose.
+
+    Args:
+        body: the body model.
+        betas: [S], shape parameters.
+        skeleton: skeleton of the body with these shape parameters.
+    """
     body = body.to(torch.float64)
     vertices = body.pose(skeleton.canonical_pose[None], betas).vertices[0]
     return MeshTemplate(vertices.numpy(), body.faces.numpy().astype(np.int32), body.weights.numpy())
 
 
 def body_sequence(name: str, split: Split, motion: Motion, body: Body, betas: NDArray[np.float64]) -> SequenceSpec:
-    """Return a sequence whose meshes are those of a body model in the poses of a motion."""
+    """Return a sequence whose meshes are a body model in the poses of a motion; `betas` [S] are its shape parameters."""
     return SequenceSpec(name, split, motion, BodyMeshes(body, betas, motion.poses, motion.translation))

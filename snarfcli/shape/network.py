@@ -43,7 +43,7 @@ class ShapeConfig:
     weight_norm: bool = True
     """Whether the layers are weight-normalised."""
     prior_radius_m: float | None = None
-    """Radius of capsules around the bones, metres, which the network corrects; null for no such prior."""
+    """Prior of the shape: capsules around the bones with this radius, metres, which the network corrects; null for none."""
 
 
 class OccupancyNetwork(nn.Module):

@@ -22,7 +22,7 @@ class TrainingConfig:
     surface_points: int = MISSING
     """Number of points per frame from the near-surface half of its samples."""
     far_points: int = MISSING
-    """Number of points per frame drawn in the canonical cells; those moved out of the sampling cube by the pose are outside."""
+    """Number of points per frame drawn in the canonical cells; if posed outside the sampling cube, they count as outside."""
     fresh_points: bool = MISSING
     """Whether every step draws and labels new points from the stored meshes, instead of choosing among the stored points."""
     workers: int | None = MISSING

@@ -312,7 +312,7 @@ def test_files_of_two_skeletons_are_told_apart(animal, tmp_path):
 
 def test_a_rig_without_animation_is_refused(animal, tmp_path):
     (tmp_path / "rex.glb").write_bytes(animal_glb(animal, []))
-    with pytest.raises(UserError, match=r"rex.glb has no animation, which an avatar is learned from"):
+    with pytest.raises(UserError, match=r"rex.glb has no animations, but an avatar is learned from them"):
         meshes.load("rex", request(tmp_path))
 
 

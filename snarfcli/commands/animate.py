@@ -28,7 +28,7 @@ from snarfcli.files import write_json
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.mesh_files import MESH_WRITERS
-from snarfcli.meshing.posed import SURFACES
+from snarfcli.meshing.posed import RESOLUTIONS, SURFACES
 from snarfcli.meshing.surfaces import canonical_surface
 from snarfcli.motions import Motion
 from snarfcli.parallel import count_cores, parse_processes
@@ -45,7 +45,6 @@ __all__ = ["AnimateConfig", "run"]
 
 log = logging.getLogger(__name__)
 
-_RESOLUTIONS = (16, 1024)  # dense lattices: 1024 takes about 4 GB for a body with spread arms
 _LARGEST_PICTURE = 4096
 _TRUE_FRAMES, _TRUE_POINTS = 16, 300  # sampled from the ground truth, so that the camera shows all of it
 
@@ -128,7 +127,7 @@ def _check(config: AnimateConfig) -> _Plan:
     for name, choices in (("surface", SURFACES), ("format", tuple(MESH_WRITERS)), ("camera", CAMERAS)):
         check_choice(name, getattr(config, name), choices)
     check_motion_selection(config)
-    check_number("resolution", config.resolution, *_RESOLUTIONS)
+    check_number("resolution", config.resolution, *RESOLUTIONS)
     check_number("keep_share", config.keep_share, 0, 1)
     check_number("azimuth_deg", config.azimuth_deg, -360, 360)
     check_number("elevation_deg", config.elevation_deg, -89, 89)

@@ -19,7 +19,7 @@ from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import evaluate
 from snarfcli.evaluation.figure import write_figure
-from snarfcli.evaluation.report import SPLITS, EvaluationReport, metrics_content, table, timings_text
+from snarfcli.evaluation.report import SPLITS, STORE_SPLITS, EvaluationReport, metrics_content, table, timings_text
 from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
 from snarfcli.files import write_json
@@ -31,8 +31,6 @@ from snarfcli.samples.store import SampleStore
 __all__ = ["EvalConfig", "run"]
 
 log = logging.getLogger(__name__)
-
-_STORE_SPLITS = {"id": "test", "ood": "ood"}
 
 
 @dataclass
@@ -92,7 +90,7 @@ def run(config: EvalConfig) -> None:
     set_threads(config.threads)
     seed_everything(config.seed)
     store = SampleStore.open(config.data_root, config.data.name, config.subject)
-    sequences = store.sequences(_STORE_SPLITS[config.split])
+    sequences = store.sequences(STORE_SPLITS[config.split])
     avatar = Avatar.load(path, device)
     _check_match(avatar, store, config)
     if config.search is not None:

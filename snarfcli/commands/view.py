@@ -22,6 +22,7 @@ from snarfcli.commands.selection import (
     select_motion,
 )
 from snarfcli.errors import UserError
+from snarfcli.meshing.posed import RESOLUTIONS
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL, layout_of
 from snarfcli.names import unique_names
@@ -32,8 +33,6 @@ from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_
 __all__ = ["ViewConfig", "run", "start"]
 
 log = logging.getLogger(__name__)
-
-_RESOLUTIONS = (16, 1024)
 
 
 @dataclass
@@ -112,7 +111,7 @@ def _check(config: ViewConfig) -> int:
     """Check all settings before any work starts; return the port, 0 for any free one."""
     check_motion_selection(config)
     check_choice("surface", config.surface, SURFACE_NAMES)
-    check_number("resolution", config.resolution, *_RESOLUTIONS)
+    check_number("resolution", config.resolution, *RESOLUTIONS)
     text = config.port.strip()
     if text == "auto":
         return 0

@@ -10,10 +10,22 @@ from typing import Any
 
 from snarfcli.evaluation.metrics import FrameMetrics, Summary, group_by_sequence, mean_of_sequences, summarise
 
-__all__ = ["PROTOCOL", "REFERENCE_POINTS", "SPLITS", "EvaluationReport", "metrics_content", "plain", "table", "timings_text"]
+__all__ = [
+    "PROTOCOL",
+    "REFERENCE_POINTS",
+    "SPLITS",
+    "STORE_SPLITS",
+    "EvaluationReport",
+    "metrics_content",
+    "plain",
+    "table",
+    "timings_text",
+]
 
 SPLITS = {"id": "in distribution", "ood": "out of distribution"}
 """Splits that can be evaluated: held-out motion like that of the training, and poses unlike it."""
+STORE_SPLITS = {"id": "test", "ood": "ood"}
+"""Names of these splits in the samples."""
 
 REFERENCE_POINTS = 200_000
 """Number of points for which the papers' table states times (Fast-SNARF table 1)."""

@@ -13,13 +13,13 @@ from snarfcli.export.deviation import Deviation
 from snarfcli.export.morphs import ShapeBasis
 from snarfcli.export.rig import LocalTransforms
 from snarfcli.meshing.mesh import Mesh
+from snarfcli.meshing.posed import RESOLUTIONS
 
 __all__ = ["Character", "CharacterClip", "CharacterErrors", "CharacterOptions", "check_options"]
 
 INFLUENCES = (4, 8)
 TRIANGLES = (100, 5_000_000)
 MORPH_TARGETS = (0, 64)
-RESOLUTIONS = (16, 1024)
 
 
 @dataclass(frozen=True)

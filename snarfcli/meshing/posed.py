@@ -9,10 +9,12 @@ from snarfcli.meshing.skinned import skinned_surface
 from snarfcli.meshing.surfaces import field_surface
 from snarfcli.models.trained_field import TrainedField
 
-__all__ = ["SURFACES", "posed_mesh"]
+__all__ = ["RESOLUTIONS", "SURFACES", "posed_mesh"]
 
 SURFACES = ("field", "skinned")
 """Kinds of surfaces: the surface of the posed field, and the canonical mesh moved by linear blend skinning."""
+RESOLUTIONS = (16, 1024)
+"""Range of voxels along the longest side. Lattices are dense: 1024 takes about 4 GB for a body with spread arms."""
 
 
 def posed_mesh(

@@ -16,6 +16,7 @@ import torch
 from snarfcli.avatar import Avatar
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import choose_frames
+from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import atomic_path, read_json
 from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.mesh import Mesh
@@ -231,7 +232,7 @@ def _store(result: Result, split: str) -> SampleStore:
 def _frames(result: Result, split: str, count: int) -> Iterator[tuple[SequenceSamples, int]]:
     """Yield frames of a split, evenly spaced over its sequences; no frame if the data set has no such split."""
     try:
-        sequences = _store(result, split).sequences("test" if split == "id" else "ood")
+        sequences = _store(result, split).sequences(STORE_SPLITS[split])
     except UserError:
         return
     yield from choose_frames(sequences, count)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from snarfcli.errors import UserError
+from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json, write_json
 from snarfcli.locks import locked
 from snarfcli.reproduce.plans import EvaluationStage, Job
@@ -171,7 +172,7 @@ class _Stages:
     def _can_be_evaluated(self, evaluation: EvaluationStage) -> bool:
         """Return whether the samples have frames of this split; a data set without them is no failure of the run."""
         folder = samples_folder(evaluation.data_root, evaluation.data, self.job.subject)
-        return _frames(folder, "test" if evaluation.split == "id" else "ood") != 0
+        return _frames(folder, STORE_SPLITS[evaluation.split]) != 0
 
     def _write(self, **changes: Any) -> None:
         self.status = replace(self.status, **changes)

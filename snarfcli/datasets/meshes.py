@@ -131,7 +131,9 @@ def _read_skeleton(folder: Path, sequences: list[Path]) -> tuple[Path, SkeletonF
     if len(files) > 1:
         raise UserError(f"{folder}: wanted one skeleton, got {files[0].name} and {files[1].name}; remove one")
     if not files:
-        files = [path / "motion.bvh" for path in sequences if (path / "motion.bvh").is_file()][:1]
+        files = [path / "motion.bvh" for path in (folder, *sequences) if (path / "motion.bvh").is_file()][:1]
+    if not files:
+        raise UserError(f"{folder}: wanted a skeleton file or a motion.bvh, got neither; see data/README.md")
     path = files[0]
     return path, bvh_skeleton(path) if path.suffix == ".bvh" else read_skeleton(path)
 

@@ -24,6 +24,7 @@ _BAND_M = 0.03  # cloth spans hollows narrower than about twice this
 _LEAST_STAND_OFF_M = 0.012
 _SAME_M = 1e-5  # the union moves vertices by at most the rounding of single precision
 _NEIGHBOURS = 400  # of 6,890 body vertices
+_LEAF_SIZE = 16
 _LEAST_SHARE = 1e-5
 
 
@@ -180,7 +181,8 @@ def _shares(vertices: NDArray, faces: NDArray, joined: NDArray, stand_off: NDArr
     """Return the weights [V, B] with which each vertex of the joined mesh follows the body vertices."""
     import igl
 
-    distance, followed = map(np.asarray, KDTree(vertices).query(joined, k=_NEIGHBOURS))
+    # The size of the leaves decides between vertices at the same distance, as on both sides of the plane of symmetry.
+    distance, followed = map(np.asarray, KDTree(vertices, leafsize=_LEAF_SIZE).query(joined, k=_NEIGHBOURS))
     # The further from the body, the more of its vertices count.
     width = 0.02 + 0.8 * np.maximum(stand_off, 0)[:, None]
     shares = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / width**2)

@@ -26,6 +26,7 @@ __all__ = [
 # point without a correspondence has a very negative one.
 _LARGEST_LOGIT = 10.0
 _NEIGHBOURS = 8  # candidates for the nearest vertex that faces the same way
+_LEAF_SIZE = 16  # decides between vertices at the same distance
 # Width, in cells, of the extra layer around the surface that is split. Bodies are of one piece: without such a layer, 40 meshes
 # of two avatars were the same, with 12 % fewer evaluations.
 _DILATE = 0
@@ -137,7 +138,7 @@ def _borrow_weights(avatar: TrainedField, transforms: Tensor, mesh: Mesh, mesh_c
     vertices = in_chunks(lambda points_c: avatar.skin(points_c, transforms), mesh_c.vertices)
     count = min(_NEIGHBOURS, len(vertices))
     # A hand on a hip is also near the vertices of the hip, but those face the other way.
-    nearest = np.reshape(KDTree(vertices).query(mesh.vertices, k=count)[1], (len(mesh.vertices), count))
+    nearest = np.reshape(KDTree(vertices, leafsize=_LEAF_SIZE).query(mesh.vertices, k=count)[1], (len(mesh.vertices), count))
     facing = np.einsum("vk,vnk->vn", mesh.unit_normals, vertex_normals(vertices, mesh_c.faces)[nearest]) > 0
     choice = np.where(facing.any(axis=1), facing.argmax(axis=1), 0)
     return mesh_c.weights[nearest[np.arange(len(nearest)), choice]]

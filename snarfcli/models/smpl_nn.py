@@ -17,6 +17,7 @@ from snarfcli.shape import CONDITIONS
 __all__ = ["SmplNN"]
 
 _PAIRS_AT_ONCE = 2**26  # maximum number of distances in memory at once on a GPU
+_LEAF_SIZE = 16  # decides between vertices at the same distance
 
 
 class SmplNN(PointwiseSystem):
@@ -57,7 +58,7 @@ def nearest_vertex(points: Tensor, vertices: Tensor) -> Tensor:
         from scipy.spatial import KDTree
 
         finite = np.nan_to_num(points.detach().numpy(), posinf=1e6, neginf=-1e6)
-        return torch.from_numpy(KDTree(vertices.detach().numpy()).query(finite)[1]).long()
+        return torch.from_numpy(KDTree(vertices.detach().numpy(), leafsize=_LEAF_SIZE).query(finite)[1]).long()
     parts = points.split(max(1, _PAIRS_AT_ONCE // len(vertices)))
     # From differences: from a matrix product, distances of 1 cm are wrong by millimetres some metres from the origin.
     exact = "donot_use_mm_for_euclid_dist"

@@ -17,7 +17,7 @@ from pathlib import Path
 from unittest import mock
 
 import torch
-from common import arguments, median_and_spread, print_machine, print_table, require, timed
+from common import arguments, in_pytorch, median_and_spread, print_machine, print_table, require, timed
 
 from snarfcli.avatar import Avatar
 from snarfcli.meshing.extract import extract_surface
@@ -39,7 +39,7 @@ def main() -> None:
     print_machine()
     print(f"network: {shape.depth} layers of {shape.width}, {shape.activation}; condition: {avatar.config.condition.name}\n")
     rows = [_row(avatar, pose, surface, r, options.repeats) for surface in ("field", "skinned") for r in options.resolutions]
-    with mock.patch.object(system, "can_evaluate", return_value=False):
+    with mock.patch.object(system, "can_evaluate", return_value=False), in_pytorch():
         rows += [_row(avatar, pose, "field", r, options.repeats, ", network in PyTorch") for r in options.resolutions]
     print_table(["surface", "resolution", "first, ms", "then, ms per frame", "vertices", "points evaluated"], rows)
     if options.memory:

@@ -8,7 +8,7 @@ Untrained networks of the sizes of the papers and of the quick training, with gl
 from __future__ import annotations
 
 import torch
-from common import arguments, print_machine, print_table, timed
+from common import arguments, in_pytorch, print_machine, print_table, timed
 
 from snarfcli.precision import network_precision
 from snarfcli.shape import OccupancyNetwork, ShapeConfig
@@ -38,8 +38,9 @@ def main() -> None:
             inputs = (points, condition, pose, seen)
             with torch.no_grad():
                 native = min(timed(lambda n=network, i=inputs: evaluate(n, *i), options.repeats))
-                plain = min(timed(lambda n=network, i=inputs: n(*i), options.repeats))
-                with network_precision("medium", points.device):
+                with in_pytorch():
+                    plain = min(timed(lambda n=network, i=inputs: n(*i), options.repeats))
+                with in_pytorch(), network_precision("medium", points.device):
                     medium = min(timed(lambda n=network, i=inputs: n(*i), options.repeats))
             rows.append([name, kind, f"{1e3 * native:.1f}", *(f"{1e3 * t:.1f} ({t / native:.1f} x)" for t in (plain, medium))])
     header = ["network", "condition", f"native, ms for {options.points:,} points", "PyTorch", 'PyTorch, precision "medium"']

@@ -43,7 +43,7 @@ def measure(name: str, search: str, store: SampleStore, steps: int, repeats: int
         loss = forward()
         with matmul_precision(trainer.config.precision):
             loss.backward()
-        trainer.optimizer.zero_grad(set_to_none=True)
+        trainer.optimizer.zero_gradients()
 
     both = timed(forward_and_backward, repeats)
     backward = [whole - a - b for whole, a, b in zip(both, parts["search"][1:], parts["shape"][1:], strict=True)]

@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from unittest import mock
 
 import torch
 
 from snarfcli.runs import machine_facts
 
-__all__ = ["arguments", "median_and_spread", "print_machine", "print_table", "timed"]
+__all__ = ["arguments", "in_pytorch", "median_and_spread", "print_machine", "print_table", "timed"]
 
 
 def arguments(description: str, **extra: dict) -> argparse.Namespace:
@@ -44,6 +46,15 @@ def timed(work: Callable[[], object], repeats: int) -> list[float]:
         work()
         seconds.append(time.perf_counter() - start)
     return seconds
+
+
+@contextmanager
+def in_pytorch() -> Iterator[None]:
+    """Evaluate networks layer by layer in PyTorch instead of natively."""
+    with ExitStack() as stack:
+        for module in ("perceptron", "encoding", "capsules"):
+            stack.enter_context(mock.patch(f"snarfcli.networks.{module}.choose_backend", return_value="reference"))
+        yield
 
 
 def median_and_spread(seconds: Sequence[float]) -> str:

@@ -23,6 +23,7 @@ LAYERS = (
     ("datasets", "meshing"),
     ("models", "motions"),
     ("bodies", "deformer", "shape"),
+    ("networks",),
     (
         "checks",
         "files",

@@ -42,7 +42,8 @@ def training_config(**changes: object) -> TrainingConfig:
     config = TrainingConfig(
         name="toy", steps=150, poses_per_step=3, uniform_points=200, surface_points=200, far_points=20, fresh_points=False,
         workers=0, learning_rate=1e-2,
-        final_learning_rate=0.05, warmup_steps=5, average_decay=0.95, bootstrap_steps=50, bone_occupancy_weight=0.1,
+        feature_rate=3.0, final_learning_rate=0.05,
+        warmup_steps=5, average_decay=0.95, bootstrap_steps=50, bone_occupancy_weight=0.1,
         bone_points=5, joint_weight=1.0, joint_target="halves", refresh_cells_every=40, precision="highest",
         validate_every=75, validation_frames=2, checkpoint_every=50,
     )  # fmt: skip

@@ -8,6 +8,7 @@
 #include "complete_search.h"
 #include "dispatch.h"
 #include "network.h"
+#include "training.h"
 #include "roots.h"
 #include "snarf/api.h"
 
@@ -201,4 +202,42 @@ int snarf_evaluate(const snarf_network* network, const float* points, const floa
                    float* logits) {
   if (!valid(network, points, extras, count, threads, logits)) return SNARF_BAD_ARGUMENT;
   return in_number_type(4, [&](auto) { Network(*network).run(points, extras, count, threads, logits); });
+}
+
+int64_t snarf_saved_size(const snarf_perceptron* network, int64_t count) {
+  return valid(network) && count >= 0 ? Training::saved_size(*network, count) : -1;
+}
+
+int snarf_forward(const snarf_perceptron* network, const float* first, const float* extras, int64_t count, float* saved,
+                  float* out) {
+  if (!valid(network) || count < 0 || (count && (!first || !out || (network->extra_count && !extras))))
+    return SNARF_BAD_ARGUMENT;
+  return in_number_type(4, [&](auto) { Training(*network).forward(first, extras, count, saved, out); });
+}
+
+int snarf_backward(const snarf_perceptron* network, const float* first, const float* extras, int64_t count, const float* saved,
+                   const float* v_out, float* const* v_weights, float* const* v_bias, float* v_first, float* v_extras) {
+  if (!valid(network) || count < 0 || !v_weights || !v_bias) return SNARF_BAD_ARGUMENT;
+  if (count && (!first || !v_out || (network->extra_count && !extras))) return SNARF_BAD_ARGUMENT;
+  return in_number_type(
+      4, [&](auto) { Training(*network).backward(first, extras, count, saved, v_out, v_weights, v_bias, v_first, v_extras); });
+}
+
+int snarf_encode(const snarf_encoding* encoding, float* out) {
+  if (!valid(encoding) || (encoding->count && !out)) return SNARF_BAD_ARGUMENT;
+  return in_number_type(4, [&](auto) { Encoding(*encoding).forward(out); });
+}
+
+int snarf_encode_backward(const snarf_encoding* encoding, const float* out, const float* v_out, float* v_points,
+                          float* v_table) {
+  if (!valid(encoding) || (encoding->count && (!out || !v_out))) return SNARF_BAD_ARGUMENT;
+  return in_number_type(4, [&](auto) { Encoding(*encoding).backward(out, v_out, v_points, v_table); });
+}
+
+int snarf_segment_distances(const float* points, int64_t count, const float* segments, int32_t segment_count, int32_t threads,
+                            float* distance, float* direction) {
+  if (count < 0 || segment_count < 1 || !segments || threads < 1) return SNARF_BAD_ARGUMENT;
+  if (count && (!points || !distance || !direction)) return SNARF_BAD_ARGUMENT;
+  const DistanceTask task = {points, segments, segment_count, distance, direction};
+  return in_number_type(4, [&](auto) { distances(task, count, threads); });
 }

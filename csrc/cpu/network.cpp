@@ -1,131 +1,15 @@
 // The canonical occupancy network without gradients, compiled once per instruction set.
 //
-// DESIGN. A tile of points goes through all layers before the next tile starts. A SIMD lane is a point, and arrays of values
-// are [value, point], so that activations, the encoding and the distance to the bones need no shuffles. A layer is computed for
-// kOutputs outputs and kPacks packs of points at once, whose sums stay in registers. Each loaded pack of values is used for
-// kOutputs products, and each loaded weight for kPacks products, so that arithmetic, not memory, limits the speed. The weights
-// are stored in the order in which they are used.
-#include <math.h>
-
-#include "lanes.h"
-#include "network_task.h"
+// DESIGN. A tile of points goes through all layers (layer.h) before the next tile starts, so that its values stay in the cache.
+#include "capsules.h"
+#include "features.h"
+#include "layer.h"
 
 namespace snarf {
 namespace SNARF_ISA {
 namespace {
 
-using V = Lanes<float>;
-constexpr int kPacks = kVectorBytes == 64 ? 4 : 2;  // the sums take 24 of 32 vector registers, or 12 of 16
-constexpr int kColumn = kPacks * V::width;          // points whose sums are computed at once
-static_assert(kTile % kColumn == 0, "tiles are made of whole columns");
-
-// sums[o][p] += weights[k][o] * values[k][p] for all k < count. `weights` is [count, kOutputs]; a row of `values` has kTile
-// points, of which the first kColumn are used.
-SNARF_HD void add_products(const float* weights, const float* values, int count, V (*sums)[kPacks]) {
-  for (int k = 0; k < count; ++k) {
-    V value[kPacks];
-    SNARF_UNROLL
-    for (int p = 0; p < kPacks; ++p) value[p] = load<float>(values + k * kTile + p * V::width);
-    SNARF_UNROLL
-    for (int o = 0; o < kOutputs; ++o) {
-      const V weight(weights[k * kOutputs + o]);
-      SNARF_UNROLL
-      for (int p = 0; p < kPacks; ++p) sums[o][p] = sums[o][p] + weight * value[p];
-    }
-  }
-}
-
-// e^x for x <= 0, with a relative error of at most 4e-6. An x below -20 counts as -20. Computed as (e^(x / 64))^64, the inner
-// one by its Taylor series.
-SNARF_HD V decay(V x) {
-  const V y = larger(x, V(-20.f)) * V(1.f / 64);
-  V e = V(1.f / 720);
-  e = e * y + V(1.f / 120);
-  e = e * y + V(1.f / 24);
-  e = e * y + V(1.f / 6);
-  e = e * y + V(0.5f);
-  e = e * y + V(1.f);
-  e = e * y + V(1.f);
-  SNARF_UNROLL
-  for (int i = 0; i < 6; ++i) e = e * e;
-  return e;
-}
-
-// log(1 + e^(sharpness x)) / sharpness. NaN stays NaN.
-SNARF_HD V softplus(V x, float sharpness) {
-  const V positive = select(x <= 0.f, V(0.f), x);
-  const V scaled = absolute(x) * sharpness;
-  if (!any(scaled < 20.f)) return positive;  // what is left out is below 2.1e-9 / sharpness
-  // log(1 + e) = 2 artanh(e / (2 + e)), whose argument is at most a third
-  const V e = decay(V(0.f) - scaled);
-  const V t = e / (e + 2.f), q = t * t;
-  V series = q * V(1.f / 11) + V(1.f / 9);
-  series = series * q + V(1.f / 7);
-  series = series * q + V(1.f / 5);
-  series = series * q + V(1.f / 3);
-  series = series * q + V(1.f);
-  return positive + series * t * V(2.f / sharpness);
-}
-
-// `activation` is numbered as in NetworkLayer.
-SNARF_HD V activated(V x, int activation, float sharpness) {
-  if (activation == 1) return select(x <= 0.f, V(0.f), x);
-  return activation == 2 ? softplus(x, sharpness) : x;
-}
-
-// One layer for a tile. `hidden`, `encoded`, `extras` and `out` are [value, kTile]; out has layer.outputs rows.
-void run_layer(const NetworkLayer& layer, const float* hidden, const float* encoded, const float* extras, float sharpness,
-               float* out) {
-  const int inputs = layer.hidden + layer.encoded + layer.extras;
-  for (int o = 0; o < layer.outputs; o += kOutputs) {
-    const float* const weights = layer.weights + int64_t(o) * inputs;
-    for (int column = 0; column < kTile; column += kColumn) {
-      V sums[kOutputs][kPacks];
-      SNARF_UNROLL
-      for (int i = 0; i < kOutputs; ++i) SNARF_UNROLL
-      for (int p = 0; p < kPacks; ++p) sums[i][p] = V(layer.bias[o + i]);
-      add_products(weights, hidden + column, layer.hidden, sums);
-      add_products(weights + kOutputs * layer.hidden, encoded + column, layer.encoded, sums);
-      add_products(weights + kOutputs * (layer.hidden + layer.encoded), extras + column, layer.extras, sums);
-      SNARF_UNROLL
-      for (int i = 0; i < kOutputs; ++i) SNARF_UNROLL
-      for (int p = 0; p < kPacks; ++p)
-        store(out + (o + i) * kTile + column + p * V::width, activated(sums[i][p], layer.activation, sharpness));
-    }
-  }
-}
-
-// Sine and cosine of angles up to a few thousand radians, with an error of at most 2e-7: Cody and Waite's reduction by quarter
-// turns, then Taylor series.
-SNARF_HD void sine_cosine(V angle, V& sine, V& cosine) {
-  const V turns = angle * V(0.63661977236758134f);  // quarter turns: 2 / pi per radian
-  const V quarter = truncate(turns + select(turns >= 0.f, V(0.5f), V(-0.5f)));
-  V r = angle - quarter * V(1.5703125f);  // pi / 2 in three parts, so that little is lost by rounding
-  r = r - quarter * V(4.83751296997e-4f);
-  r = r - quarter * V(7.549789948769e-8f);
-  const V q = r * r;
-  V s = q * V(2.7557319e-6f) + V(-1.9841270e-4f);
-  s = s * q + V(8.3333333e-3f);
-  s = s * q + V(-1.6666667e-1f);
-  s = s * q * r + r;
-  V c = q * V(-2.7557319e-7f) + V(2.4801587e-5f);
-  c = c * q + V(-1.3888889e-3f);
-  c = c * q + V(4.1666667e-2f);
-  c = c * q + V(-0.5f);
-  c = c * q + V(1.f);
-  const V half = truncate(quarter * V(0.5f)), fourth = truncate(quarter * V(0.25f));
-  const V odd = absolute(quarter - half * V(2.f));  // 1 on odd quarters
-  const V rest = quarter - fourth * V(4.f);         // quarter turns without full turns, -3 to 3
-  const LaneMask<float> swap = odd > 0.5f;
-  const LaneMask<float> sine_down = ((rest >= 1.5f) & (rest <= 3.5f)) | ((rest >= -2.5f) & (rest <= -0.5f));
-  const LaneMask<float> cosine_down = ((rest >= 0.5f) & (rest <= 2.5f)) | ((rest >= -3.5f) & (rest <= -1.5f));
-  const V a = select(swap, c, s), b = select(swap, s, c);
-  sine = select(sine_down, V(0.f) - a, a);
-  cosine = select(cosine_down, V(0.f) - b, b);
-}
-
-// The points themselves, then the sines for all frequencies and axes, then the cosines, in the order of
-// OccupancyNetwork._encode (snarfcli/shape/network.py). `points` is [3, kTile], `encoded` [3 + 6 K, kTile] with K frequencies.
+// The points themselves, then sines of all axes and frequencies, then cosines, as OccupancyNetwork._encode has them.
 void encode(const NetworkTask& task, const float* points, float* encoded) {
   const int waves = 3 * task.frequency_count;
   for (int axis = 0; axis < 3; ++axis)
@@ -141,34 +25,25 @@ void encode(const NetworkTask& task, const float* points, float* encoded) {
     }
 }
 
+// Features of each level, after what `encode` wrote.
+void add_features(const NetworkTask& task, const float* points, float* encoded) {
+  float values[kMostFeatures];
+  float* rows = encoded + int64_t(kTile) * (3 + 6 * task.frequency_count);
+  for (int l = 0; l < task.level_count; ++l, rows += int64_t(kTile) * task.features)
+    for (int i = 0; i < kTile; ++i) {
+      const float point[3] = {points[i], points[kTile + i], points[2 * kTile + i]};
+      interpolate(task.table, task.features, task.levels[l], point, values);
+      for (int f = 0; f < task.features; ++f) rows[f * kTile + i] = values[f];
+    }
+}
+
 // Adds to `values` [kTile] the logits of capsules around the bones, as OccupancyNetwork does. `points` is [3, kTile].
 void add_capsules(const NetworkTask& task, const float* points, float* values) {
   for (int i = 0; i < kTile; i += V::width) {
-    V x[3], nearest(3.4e38f);  // squared distance to the nearest bone
+    V x[3];
     for (int axis = 0; axis < 3; ++axis) x[axis] = load<float>(points + axis * kTile + i);
-    for (int s = 0; s < task.segment_count; ++s) {
-      const float* const start = task.segments + 6 * s;
-      float along[3], length = 0;
-      for (int axis = 0; axis < 3; ++axis) {
-        along[axis] = start[3 + axis] - start[axis];
-        length += along[axis] * along[axis];
-      }
-      V from[3], share(0.f), squared(0.f);
-      for (int axis = 0; axis < 3; ++axis) {
-        from[axis] = x[axis] - start[axis];
-        share = share + from[axis] * along[axis];
-      }
-      share = smaller(larger(share * V(1.f / (length > 1e-12f ? length : 1e-12f)), V(0.f)), V(1.f));
-      for (int axis = 0; axis < 3; ++axis) {
-        const V away = from[axis] - share * along[axis];
-        squared = squared + away * away;
-      }
-      nearest = smaller(squared, nearest);
-    }
-    float distance[V::width];
-    store(distance, larger(nearest, V(1e-12f)));
-    for (int lane = 0; lane < V::width; ++lane) distance[lane] = sqrtf(distance[lane]);
-    store(values + i, load<float>(values + i) + (V(task.radius) - load<float>(distance)) * task.slope);
+    const V distance = distance_to_segments(x, task.segments, task.segment_count, nullptr);
+    store(values + i, load<float>(values + i) + (V(task.radius) - distance) * task.slope);
   }
 }
 
@@ -177,7 +52,7 @@ void add_capsules(const NetworkTask& task, const float* points, float* values) {
 void run_network(const NetworkTask& task, int64_t first, int64_t last, float* scratch) {
   const int64_t tile = kTile;
   float* const encoded = scratch;
-  float* const extras = encoded + tile * (3 + 6 * task.frequency_count);
+  float* const extras = encoded + tile * task.encoded();
   float* values = extras + tile * task.extra_count;
   float* next = values + tile * task.widest;
   for (int64_t begin = first; begin < last; begin += tile) {
@@ -189,6 +64,7 @@ void run_network(const NetworkTask& task, int64_t first, int64_t last, float* sc
       for (int e = 0; e < task.extra_count; ++e) extras[e * tile + i] = task.extras[row * task.extra_count + e];
     }
     encode(task, points, encoded);
+    add_features(task, points, encoded);
     for (int n = 0; n < task.layer_count; ++n) {
       run_layer(task.layers[n], values, encoded, extras, task.sharpness, next);
       float* const previous = values;

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "dispatch.h"
+#include "feature_level.h"
 #include "network_task.h"
 #include "snarf/api.h"
 #include "team.h"
@@ -29,6 +30,7 @@ inline bool valid(const snarf_network* network, const float* points, const float
   if (count && (!points || !out || (network->extra_count && !extras))) return false;
   if (network->frequency_count < 0 || network->extra_count < 0 || network->segment_count < 0) return false;
   if ((network->frequency_count && !network->frequencies) || (network->segment_count && !network->segments)) return false;
+  if (!valid(network->levels, network->level_count, network->features, network->rows)) return false;
   int hidden = 0;
   for (int n = 0; n < network->layer_count; ++n) {
     const snarf_layer& layer = network->layers[n];
@@ -45,12 +47,17 @@ class Network {
     task_.layer_count = network.layer_count;
     task_.frequencies = network.frequencies;
     task_.frequency_count = network.frequency_count;
+    task_.level_count = network.level_count;
+    task_.features = network.level_count ? network.features : 0;
+    task_.table = network.table;
     task_.segments = network.segments;
     task_.segment_count = network.segment_count;
     task_.radius = network.radius;
     task_.slope = network.slope;
     task_.sharpness = network.sharpness;
     task_.extra_count = network.extra_count;
+    for (int l = 0; l < network.level_count; ++l) levels_.push_back(feature_level(network.levels[l]));
+    task_.levels = levels_.data();
     task_.widest = 0;
     int hidden = 0;
     for (int n = 0; n < network.layer_count; ++n) {
@@ -87,7 +94,7 @@ class Network {
   void pack(const snarf_layer& layer, int hidden) {
     NetworkLayer packed;
     packed.hidden = hidden;
-    packed.encoded = layer.takes_point ? 3 + 6 * task_.frequency_count : 0;
+    packed.encoded = layer.takes_point ? task_.encoded() : 0;
     packed.extras = layer.takes_extras ? task_.extra_count : 0;
     packed.outputs = (layer.outputs + kOutputs - 1) / kOutputs * kOutputs;
     packed.activation = layer.activation;
@@ -106,6 +113,7 @@ class Network {
   }
 
   NetworkTask task_;
+  std::vector<FeatureLevel> levels_;
   std::vector<NetworkLayer> layers_;
   std::vector<std::vector<float>> weights_, biases_;
 };

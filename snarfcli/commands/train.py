@@ -131,7 +131,7 @@ def run(config: TrainConfig) -> None:
     elif config.overwrite and folder.exists():
         shutil.rmtree(folder)
     _write_config(folder, config)
-    parameters = sum(p.numel() for p in trainer.parameters)
+    parameters = sum(p.numel() for p in trainer.optimizer.parameters)
     log.info("run: %s, %s parameters, %d steps on %s", folder, f"{parameters:,}", config.training.steps, device)
 
     start = time.time()
@@ -175,7 +175,11 @@ def _check(config: TrainConfig) -> None:
     check_number("training.average_decay", training.average_decay, 0, 1)
     check_choice("training.precision", training.precision, PRECISIONS)
     check_choice("training.joint_target", training.joint_target, JOINT_TARGETS)
-    check_choice("shape.name", config.shape.name, ("mlp",))
+    check_choice("shape.name", config.shape.name, ("mlp", "grid"))
+    if (config.shape.name == "grid") != bool(config.shape.feature_cells_m):
+        cells = config.shape.feature_cells_m
+        wanted = "at least one number for shape=grid" if not cells else "none for shape=mlp, which has no feature grids"
+        raise UserError(f"shape.feature_cells_m: wanted {wanted}, got {cells}; give shape=grid")
     check_choice("condition.name", config.condition.name, CONDITIONS)
     for name in ("width", "depth"):
         check_number(f"shape.{name}", getattr(config.shape, name), 1)

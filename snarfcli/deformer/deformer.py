@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -53,6 +54,7 @@ class ForwardDeformer(nn.Module):
     active_cells: Tensor
     """[D-1, H-1, W-1], bool, the cells that a complete search looks into; see `set_active_cells`."""
     _active_nodes: Tensor
+    _active_points: Tensor
     field: Callable[[Tensor], Tensor]
 
     def __init__(
@@ -84,6 +86,7 @@ class ForwardDeformer(nn.Module):
         self.register_buffer("upper", grid.upper.clone())
         self.register_buffer("active_cells", torch.ones([n - 1 for n in self.shape], dtype=torch.bool))
         self.register_buffer("_active_nodes", torch.empty(0, dtype=torch.long), persistent=False)
+        self.register_buffer("_active_points", torch.empty(0, 3), persistent=False)
         self.set_active_cells(self.active_cells if active_cells is None else active_cells)
         self._frozen: Tensor | None = None
         self.register_load_state_dict_post_hook(_after_load)
@@ -115,14 +118,21 @@ class ForwardDeformer(nn.Module):
         """
         if self._frozen is not None:
             return self._frozen
-        at_nodes = self.field.at_nodes if isinstance(self.field, GridWeights) else None
-        nodes = self.grid.nodes(self.shape).reshape(-1, 3)
         if not active_only:
-            weights = self._checked(self.field(nodes) if at_nodes is None else at_nodes(), len(nodes))
-            return weights.reshape(*self.shape, -1)
+            return self._weights_of_nodes(None).reshape(*self.shape, -1)
         used = self._active_nodes
-        weights = self._checked(self.field(nodes[used]) if at_nodes is None else at_nodes(used), len(used))
-        return weights.new_zeros(len(nodes), self.num_bones).index_copy(0, used, weights).reshape(*self.shape, -1)
+        weights = self._weights_of_nodes(used)
+        return weights.new_zeros(math.prod(self.shape), self.num_bones).index_copy(0, used, weights).reshape(*self.shape, -1)
+
+    def _weights_of_nodes(self, nodes: Tensor | None) -> Tensor:
+        """Return the weights [K, J] at the active nodes, given as `nodes`, or at all nodes if None."""
+        count = math.prod(self.shape) if nodes is None else len(nodes)
+        if isinstance(self.field, GridWeights):
+            return self._checked(self.field.at_nodes(nodes), count)
+        points = self.grid.nodes(self.shape).reshape(-1, 3) if nodes is None else self._active_points
+        # not a subclass, whose `forward` may be another one
+        evaluate = self.field.at_fixed_points if type(self.field) is NetworkWeights else self.field
+        return self._checked(evaluate(points), count)
 
     def node_weights(self, active_only: bool | None = None) -> NodeWeights | None:
         """Evaluate the skinning weights at the nodes that a search reads; None for a field that is searched directly.
@@ -226,8 +236,9 @@ class ForwardDeformer(nn.Module):
         self._update_active_nodes()
 
     def _update_active_nodes(self) -> None:
-        """Keep the flat indices of the nodes of active cells, [K]: finding them waits for a GPU."""
+        """Keep the nodes of active cells, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
         self._active_nodes = corners_of(self.active_cells).reshape(-1).nonzero()[:, 0]
+        self._active_points = self.grid.nodes(self.shape).reshape(-1, 3)[self._active_nodes]
 
     def is_active(self, canonical: Tensor) -> Tensor:
         """Return whether canonical points [N, 3] lie in cells that a complete search looks into, [N], bool."""

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from snarfcli.deformer.blending import blend
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.networks import run_encoding
 from snarfcli.precision import matmul_precision
 
 __all__ = ["blend_transforms", "forward_jacobian", "interpolate", "skin"]
@@ -57,6 +58,14 @@ def interpolate(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:
         [N, C].
     """
     shape = values.shape[:3]
+    if not torch.is_grad_enabled() and points.device.type == "cpu" and points.dtype == values.dtype == torch.float32:
+        depth, height, width = shape
+        size = grid.cell_size(shape)
+        inside = points.clamp(grid.lower, grid.upper)
+        rows = torch.arange(depth * height * width, dtype=torch.int32)
+        box = [*grid.lower.tolist(), *size.tolist()]
+        table = values.reshape(-1, values.shape[-1])
+        return run_encoding(inside, points.new_empty(0), table, rows, [width, height, depth], box)[:, 3:]
     cell, local = locate(points, grid, shape)
     corners = cell_corners(cell, shape)
     phi = trilinear_weights(local.clamp(0, 1))

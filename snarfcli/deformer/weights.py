@@ -12,9 +12,12 @@ from torch import Tensor, nn
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
 from snarfcli.deformer.skinning import interpolate
+from snarfcli.networks import ACTIVATIONS, run_perceptron
 from snarfcli.segments import segment_distances
 
 __all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWeights", "WeightField", "total_variation"]
+
+_SHARPNESS_OF_SOFTPLUS = 100.0  # as in the papers' code
 
 
 class WeightField(nn.Module):
@@ -109,6 +112,8 @@ class NetworkWeights(WeightField):
         self.softmax = softmax
         self.sharpness = sharpness
         self.prior = prior
+        self._last_points: Tensor | None = None
+        self._last_logits = torch.empty(0)
         self.register_buffer("centre", torch.empty(0), persistent=False)
         self.register_buffer("half_extent", torch.empty(0), persistent=False)
         self.set_box(grid)
@@ -121,11 +126,35 @@ class NetworkWeights(WeightField):
         """Return the skinning weights [N, J] at canonical points [N, 3], rows sum to 1."""
         h = (canonical - self.centre) / self.half_extent
         for layer in self.layers[:-1]:
-            h = nn.functional.softplus(layer(h), beta=100)
-        logits = self.sharpness * self.layers[-1](h)
-        if self.prior is not None:
-            logits = logits + self.softmax.invert(self.prior(canonical))
-        return self.softmax(logits)
+            h = nn.functional.softplus(layer(h), beta=_SHARPNESS_OF_SOFTPLUS)
+        return self._weights(self.layers[-1](h), canonical)
+
+    def at_fixed_points(self, canonical: Tensor) -> Tensor:
+        """Return the same as `forward`, several times faster on a CPU, for the same tensor of points in step after step.
+
+        The prior at the points is kept. There are no second derivatives, which a search in the field itself needs.
+        """
+        first = (canonical - self.centre) / self.half_extent
+        linears = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        weights, biases = [layer.weight for layer in linears], [layer.bias for layer in linears]
+        takes_first, takes_extras = [1] + [0] * (len(weights) - 1), [0] * len(weights)
+        settings = (takes_first, takes_extras, ACTIVATIONS["softplus"], _SHARPNESS_OF_SOFTPLUS)
+        return self._weights(run_perceptron(first, None, weights, biases, *settings), canonical)
+
+    def _weights(self, outputs: Tensor, canonical: Tensor) -> Tensor:
+        """Return the weights [N, J] for the outputs of the network at canonical points [N, 3]."""
+        logits = self.sharpness * outputs
+        return self.softmax(logits if self.prior is None else logits + self._prior_logits(canonical))
+
+    def _prior_logits(self, canonical: Tensor) -> Tensor:
+        """Return the logits of the prior; those of the last tensor of points are kept."""
+        assert self.prior is not None
+        if canonical.requires_grad or self._last_points is not canonical:
+            logits = self.softmax.invert(self.prior(canonical))
+            if canonical.requires_grad:
+                return logits
+            self._last_points, self._last_logits = canonical, logits
+        return self._last_logits
 
 
 class GridWeights(WeightField):

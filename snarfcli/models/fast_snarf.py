@@ -13,10 +13,10 @@ from torch.nn import functional as F
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, NodeWeights, SearchConfig, cells_near
 from snarfcli.deformer.cells import corners_of
-from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
+from snarfcli.shape import OccupancyNetwork
 
 __all__ = ["FastSnarf", "FoundRoots", "blend"]
 
@@ -86,7 +86,8 @@ class FastSnarf(System):
             grid, num_bones, skinning, config.search, active, prior, parents=skeleton.parents, field=field
         )
         self.register_buffer("_kept_cells", kept, persistent=False)
-        self.shape = self._make_shape(bones)
+        self.shape = self._make_shape(bones, (grid.lower, grid.upper))
+        self._cover_features()
         self.register_buffer("_canonical_pose", skeleton.canonical_pose.float(), persistent=False)
         self._body_cells: Tensor | None = None
 
@@ -159,6 +160,13 @@ class FastSnarf(System):
         cells = self.occupied_cells(pose, _GROWTH_LOGIT, _GROWTH_M, precision)
         if self._kept_cells is not None and bool(cells.any()):
             self.deformer.set_active_cells(cells | self._kept_cells)
+            self._cover_features()
+
+    def _cover_features(self) -> None:
+        """Give features to the nodes of feature grids in active cells."""
+        grids = self.shape.grids if isinstance(self.shape, OccupancyNetwork) else None
+        if grids is not None:
+            grids.cover(self.deformer.active_cells)
 
     def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Keep only the active cells within 4 cm of what the final shape might occupy in any of the poses [P, J, 3].
@@ -199,7 +207,8 @@ class FastSnarf(System):
         """Return random points of the searched cells, moved by the poses."""
         canonical = self.deformer.random_canonical(count, generator)
         weights = self.deformer.field(canonical)  # not interpolated on the grid, which would evaluate all its nodes
-        return torch.stack([skin(canonical, weights, transforms) for transforms in bone_transforms])
+        blended = torch.einsum("nj,bjrc->bnrc", weights, bone_transforms[:, :, :3])
+        return (blended[..., :3] * canonical[:, None]).sum(-1) + blended[..., 3]
 
     def freeze(self) -> None:
         """Evaluate the skinning weights at the grid's nodes once and keep them.

@@ -86,7 +86,7 @@ class Nasa(PointwiseSystem):
             given = None if values is None else torch.tensor(values, dtype=torch.float32)
             self.register_buffer(name, given, persistent=False)
 
-    def _make_shape(self, bones: Tensor) -> PartNetworks:
+    def _make_shape(self, bones: Tensor, box: tuple[Tensor, Tensor]) -> PartNetworks:
         return PartNetworks(self.config.model, self.num_bones)
 
     def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:

@@ -17,6 +17,7 @@ from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import FieldSamples, Found, System
 from snarfcli.precision import matmul_precision
 from snarfcli.segments import distance_to_segments
+from snarfcli.shape import OccupancyNetwork
 
 __all__ = ["PointwiseSystem", "PosedNetwork", "every_point", "into_root_frame", "invert_blended", "move_with_bones"]
 
@@ -61,7 +62,9 @@ class PointwiseSystem(System):
     ) -> None:
         bones = bone_segments(skeleton)
         super().__init__(config, skeleton)
-        self.shape = self._make_shape(bones)
+        self.shape = self._make_shape(bones, (grid.lower, grid.upper))
+        if isinstance(self.shape, OccupancyNetwork) and self.shape.grids is not None:
+            self.shape.grids.cover()
         self.register_buffer("lower", grid.lower.clone())
         self.register_buffer("upper", grid.upper.clone())
         self.register_buffer("reach", distance_to_segments(surface, bones).max() + _BOX_MARGIN_M)

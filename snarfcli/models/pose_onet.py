@@ -26,7 +26,9 @@ class PoseONet(PointwiseSystem):
 
     has_canonical_shape: ClassVar[bool] = False
 
-    def _make_shape(self, bones: Tensor) -> OccupancyNetwork:
+    def _make_shape(self, bones: Tensor, box: tuple[Tensor, Tensor]) -> OccupancyNetwork:
+        if self.config.shape.feature_cells_m:
+            raise ValueError("model pose_onet has no canonical shape for feature grids; give shape=mlp")
         pose_size = 3 * (self.num_bones - 1)
         shape = replace(
             self.config.shape, condition_layer=0, condition_size=pose_size, condition_at_start=True, prior_radius_m=None

@@ -89,15 +89,20 @@ class System(nn.Module):
         self.num_bones = skeleton.num_joints
         self.register_buffer("_joints_of_bones", joints_of_bones(skeleton.parents), persistent=False)
 
-    def _make_shape(self, bones: Tensor) -> OccupancyNetwork:
-        """Return the occupancy network; `bones` [S, 2, 3] are the canonical ends of the bones, metres."""
+    def _make_shape(self, bones: Tensor, box: tuple[Tensor, Tensor]) -> OccupancyNetwork:
+        """Return the occupancy network.
+
+        Args:
+            bones: [S, 2, 3], canonical ends of the bones, metres.
+            box: corners (lower [3], upper [3]) of the canonical box, metres.
+        """
         shape, condition = self.config.shape, self.config.condition
         if condition.layer is not None:
             shape = replace(shape, condition_layer=condition.layer)
         if condition.size is not None:
             shape = replace(shape, condition_size=condition.size)
         pose_size = 0 if condition.name == "none" else 3 * (self.num_bones - 1)
-        return OccupancyNetwork(shape, pose_size, bones)
+        return OccupancyNetwork(shape, pose_size, bones, box)
 
     # ---------------------------------------------------------------- the field
     def forward(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str = "highest") -> FieldSamples:

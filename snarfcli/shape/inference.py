@@ -10,6 +10,7 @@ from ctypes import Structure, byref, c_float, c_int32, c_int64, c_void_p
 import torch
 from torch import Tensor
 
+from snarfcli.native.cpu_networks import feature_levels
 from snarfcli.native.library import native_library
 from snarfcli.shape import OccupancyNetwork
 from snarfcli.shape.network import LOGITS_PER_METRE, SOFTPLUS_SHARPNESS
@@ -36,6 +37,11 @@ class _Network(Structure):
         ("layer_count", c_int32),
         ("frequencies", c_void_p),
         ("frequency_count", c_int32),
+        ("levels", c_void_p),
+        ("level_count", c_int32),
+        ("features", c_int32),
+        ("table", c_void_p),
+        ("rows", c_int64),
         ("segments", c_void_p),
         ("segment_count", c_int32),
         ("radius", c_float),
@@ -100,11 +106,19 @@ def _evaluate(network: OccupancyNetwork, canonical: Tensor, condition: Tensor, s
             _ACTIVATIONS[config.activation] if index < config.depth else 0,
         )
     points, frequencies, bones = (values.float().contiguous() for values in (canonical, network.frequencies, network.bones))
+    grids = network.grids
+    table = (grids.table if grids else points.new_empty(0)).float().contiguous()
+    levels = feature_levels(grids.rows, grids.nodes, grids.boxes) if grids else feature_levels(table, [], [])
     native = _Network(
         ctypes.cast(layers, c_void_p),
         len(layers),
         frequencies.data_ptr(),
         len(frequencies),
+        ctypes.cast(levels, c_void_p),
+        len(levels) if grids else 0,
+        grids.features if grids else 0,
+        table.data_ptr(),
+        len(table),
         bones.data_ptr(),
         0 if config.prior_radius_m is None else len(bones),
         config.prior_radius_m or 0.0,

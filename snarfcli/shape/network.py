@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from snarfcli.segments import distance_to_segments
+from snarfcli.networks import ACTIVATIONS, run_encoding, run_perceptron, run_segment_distance
+from snarfcli.shape.features import FeatureGrids
 
 __all__ = ["LOGITS_PER_METRE", "SOFTPLUS_SHARPNESS", "OccupancyNetwork", "ShapeConfig"]
 
@@ -21,7 +21,7 @@ LOGITS_PER_METRE = 30.0
 @dataclass
 class ShapeConfig:
     name: str = "mlp"
-    """Canonical shape: mlp."""
+    """Canonical shape: mlp (a network alone) or grid (feature grids and a small network)."""
     width: int = 256
     """Width of the hidden layers."""
     depth: int = 8
@@ -42,6 +42,10 @@ class ShapeConfig:
     """Whether the network starts as a sphere with a radius of one metre (Atzmon and Lipman 2020)."""
     weight_norm: bool = True
     """Whether the layers are weight-normalised."""
+    feature_cells_m: list[float] = field(default_factory=list)
+    """Sides of the cells of feature grids, metres, one grid per number; an empty list for no grids."""
+    features: int = 4
+    """Number of features per node of a grid, 1 to 16."""
     prior_radius_m: float | None = None
     """Prior of the shape: capsules around the bones with this radius, metres, which the network corrects; null for none."""
 
@@ -53,6 +57,7 @@ class OccupancyNetwork(nn.Module):
         config: architecture.
         pose_size: length of the pose condition; 0 for none.
         bones: [S, 2, 3], canonical ends of the bones, metres, for the capsule prior.
+        box: corners (lower [3], upper [3]) of the canonical box, metres, which feature grids fill.
 
     Raises:
         ValueError: a setting of the architecture is out of range.
@@ -64,7 +69,7 @@ class OccupancyNetwork(nn.Module):
     bones: Tensor
     frequencies: Tensor
 
-    def __init__(self, config: ShapeConfig, pose_size: int, bones: Tensor) -> None:
+    def __init__(self, config: ShapeConfig, pose_size: int, bones: Tensor, box: tuple[Tensor, Tensor] | None = None) -> None:
         super().__init__()
         self.config = config
         if config.activation not in ("softplus", "relu"):
@@ -74,7 +79,12 @@ class OccupancyNetwork(nn.Module):
             raise ValueError(f"shape.condition_layer: wanted 0 to {config.depth - 1}, got {config.condition_layer}")
         self.register_buffer("bones", bones.clone())
         self.register_buffer("frequencies", torch.tensor(config.frequencies), persistent=False)
-        point_size = 3 + 6 * len(config.frequencies)
+        self.grids: FeatureGrids | None = None
+        if config.feature_cells_m:
+            if box is None:
+                raise ValueError("shape.feature_cells_m: wanted a canonical box for the feature grids, got none")
+            self.grids = FeatureGrids(*box, config.feature_cells_m, config.features)
+        point_size = 3 + 6 * len(config.frequencies) + (self.grids.size if self.grids is not None else 0)
         self.pose_code = nn.Linear(pose_size, config.condition_size) if self.conditioned else None
         layers = []
         for index in range(config.depth + 1):
@@ -82,7 +92,7 @@ class OccupancyNetwork(nn.Module):
             inputs += point_size if index in config.skip_layers else 0
             joined = config.condition_size if self.conditioned and index == config.condition_layer else 0
             layer = nn.Linear(inputs + joined, config.width if index < config.depth else 1)
-            self._initialise(layer, index, joined)
+            self._initialise(layer, index, joined, point_size)
             layers.append(nn.utils.parametrizations.weight_norm(layer) if config.weight_norm else layer)
         self.layers = nn.ModuleList(layers)
 
@@ -91,8 +101,8 @@ class OccupancyNetwork(nn.Module):
         """The layers, in the order of evaluation."""
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
-    def _initialise(self, layer: nn.Linear, index: int, joined: int) -> None:
-        """Set the initial weights of a layer; its last `joined` inputs are the pose code."""
+    def _initialise(self, layer: nn.Linear, index: int, joined: int, point_size: int) -> None:
+        """Set the initial weights of a layer; its last `joined` inputs are the pose code, those before an encoded point."""
         last = index == self.config.depth
         with torch.no_grad():
             if self.config.geometric_init:
@@ -104,8 +114,8 @@ class OccupancyNetwork(nn.Module):
                     layer.weight.normal_(0, math.sqrt(2) / math.sqrt(layer.out_features))
                     layer.bias.zero_()
                 if index == 0 or index in self.config.skip_layers:
-                    # Only the point itself has an influence at first: with the waves it would not be a sphere.
-                    waves = 6 * len(self.config.frequencies)
+                    # Only the point itself has an influence at first: with waves and features it would not be a sphere.
+                    waves = point_size - 3
                     end = layer.in_features - joined
                     layer.weight[:, end - waves : end] = 0
             elif last:
@@ -123,35 +133,39 @@ class OccupancyNetwork(nn.Module):
             pose: [M], index of the pose of each point, 0 to B - 1.
             seen: [M, P], share of each of the P equal parts of the condition at each point; None for all of it.
         """
-        encoded = self._encode(canonical)
-        h = encoded
-        for index, layer in enumerate(self.linears):
-            if index in self.config.skip_layers and index > 0:
-                h = torch.cat([h, encoded], 1) / math.sqrt(2)
-            if self.pose_code is not None and index == self.config.condition_layer:
-                weight = layer.weight
-                inputs = h.shape[1]
-                if seen is None:
-                    code = (self.pose_code(condition) @ weight[:, inputs:].T + layer.bias).index_select(0, pose)
-                else:
-                    code = _local_code(self.pose_code, condition, pose, seen) @ weight[:, inputs:].T + layer.bias
-                h = F.linear(h, weight[:, :inputs]) + code
+        extras = None
+        if self.pose_code is not None:
+            if seen is None:
+                extras = self.pose_code(condition).index_select(0, pose)
             else:
-                h = layer(h)
-            if index < len(self.layers) - 1:
-                h = F.relu(h) if self.config.activation == "relu" else F.softplus(h, beta=SOFTPLUS_SHARPNESS)
-        logits = h[:, 0]
+                extras = _local_code(self.pose_code, condition, pose, seen)
+        count = len(self.linears)
+        takes_first = [int(index == 0 or index in self.config.skip_layers) for index in range(count)]
+        takes_extras = [int(extras is not None and index == self.config.condition_layer) for index in range(count)]
+        weights = [self._weight(index, layer) for index, layer in enumerate(self.linears)]
+        biases = [layer.bias for layer in self.linears]
+        settings = (takes_first, takes_extras, ACTIVATIONS[self.config.activation], SOFTPLUS_SHARPNESS)
+        logits = run_perceptron(self._encode(canonical), extras, weights, biases, *settings)[:, 0]
         if self.config.prior_radius_m is not None:
-            distance = distance_to_segments(canonical, self.bones)
+            distance = run_segment_distance(canonical, self.bones)
             logits = logits + LOGITS_PER_METRE * (self.config.prior_radius_m - distance)
         return logits
 
+    def _weight(self, index: int, layer: nn.Linear) -> Tensor:
+        """Return the weight of a layer; where the point joins again, both parts are divided by the square root of two."""
+        weight = layer.weight
+        if index == 0 or index not in self.config.skip_layers:
+            return weight
+        joined = self.config.condition_size if self.conditioned and index == self.config.condition_layer else 0
+        scale = weight.new_full((weight.shape[1],), 1 / math.sqrt(2))
+        scale[weight.shape[1] - joined :] = 1
+        return weight * scale
+
     def _encode(self, canonical: Tensor) -> Tensor:
-        """Return points with their sine and cosine encoding, [M, 3 + 6 F]."""
-        if not len(self.frequencies):
-            return canonical
-        angles = (canonical[:, None] * self.frequencies[:, None]).flatten(1)
-        return torch.cat([canonical, angles.sin(), angles.cos()], 1)
+        """Return points with their sines and cosines, and the features of the grids there, [M, E]."""
+        if self.grids is not None:
+            return run_encoding(canonical, self.frequencies, *self.grids.arrays)
+        return run_encoding(canonical, self.frequencies) if len(self.frequencies) else canonical
 
 
 def _local_code(pose_code: nn.Linear, condition: Tensor, pose: Tensor, seen: Tensor) -> Tensor:

@@ -29,6 +29,8 @@ class TrainingConfig:
     """Number of processes that make fresh points ahead of time; null: by the number of cores. Does not change the avatar."""
     learning_rate: float = MISSING
     """Maximum learning rate of Adam."""
+    feature_rate: float = MISSING
+    """Learning rate of feature grids, as a multiple of that of the networks."""
     final_learning_rate: float = MISSING
     """Learning rate at the end as a share of the maximum, reached along a cosine; 1 keeps it constant."""
     warmup_steps: int = MISSING

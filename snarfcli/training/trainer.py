@@ -22,6 +22,7 @@ from snarfcli.precision import PRECISIONS, matmul_precision
 from snarfcli.samples.store import SampleStore
 from snarfcli.training.batches import Batch, load_frames, new_batches
 from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
+from snarfcli.training.optimizer import AveragedAdam
 from snarfcli.training.settings import TrainingConfig
 
 __all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Diverged", "Trainer"]
@@ -67,9 +68,7 @@ class Trainer:
         self.bone_owners = torch.tensor(bone_owners(avatar.skeleton), device=device)
         self.joints = avatar.skeleton.canonical_joints.to(device)
         self.joint_targets = joint_weight_targets(avatar.skeleton.parents, config.joint_target).to(device)
-        self.parameters = [p for p in self.model.parameters() if p.requires_grad]
-        self.average = [p.detach().clone() for p in self.parameters]
-        self.optimizer = torch.optim.Adam(self.parameters, lr=config.learning_rate)
+        self.optimizer = AveragedAdam(self.model, config)
         self.step = 0
 
     def advance(self) -> dict[str, float]:
@@ -82,9 +81,8 @@ class Trainer:
         if every and self.step and self.step % every == 0:
             generator = np.random.default_rng([self.seed, self.step, 2])
             self.model.refresh_cells(self.batches.poses(_POSES_OF_A_REFRESH, generator), self.config.precision)
+            self.optimizer.follow_growth()
         batch = self.batches.batch(self.step)
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate()
         if self.config.far_points:
             batch = self._with_far_points(batch)
         found = self.model.find(batch.points, batch.bone_transforms, batch.pose)
@@ -95,15 +93,12 @@ class Trainer:
         losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._generator(5), self.config.precision)
         total = reduce(torch.add, losses.values())
         self._check_finite("loss", total)
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.zero_gradients()
         with matmul_precision("medium" if self.config.precision == "bfloat16" else self.config.precision):
             total.backward()
-        gradients = [p.grad for p in self.parameters if p.grad is not None]
-        norms = torch._foreach_norm(gradients)  # pyright: ignore[reportPrivateImportUsage]  # no public name
-        self._check_finite("gradient", torch.stack(norms).sum())
-        self.optimizer.step()
+        self._check_finite("gradient", self.optimizer.gradient_norm())
+        self.optimizer.step(self.learning_rate(), self.step)
         self.step += 1
-        self._update_average()
         lost = (batch.occupied & ~field.found).sum() / batch.occupied.sum().clamp_min(1)
         numbers = {name: loss.item() for name, loss in losses.items()}
         numbers |= {"total": total.item(), "inside_without_correspondence": lost.item()}
@@ -162,19 +157,12 @@ class Trainer:
                 losses["joint_weight"] = config.joint_weight * F.mse_loss(weights, self.joint_targets.expand_as(weights))
         return losses
 
-    @torch.no_grad()
-    def _update_average(self) -> None:
-        """Move the averaged weights towards the current ones; quickly at first, since the first weights are poor."""
-        decay = min(self.config.average_decay, (1 + self.step) / (10 + self.step))
-        current = [p.detach() for p in self.parameters]
-        torch._foreach_lerp_(self.average, current, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]  # no public name
-
     def averaged_avatar(self) -> TrainedField:
         """Return a copy of the avatar with the averaged weights, ready to use."""
         avatar = self.avatar.with_model(copy.deepcopy(self.model))
         with torch.no_grad():
             trained = [p for p in avatar.model.parameters() if p.requires_grad]
-            for parameter, average in zip(trained, self.average, strict=True):
+            for parameter, average in zip(trained, self.optimizer.average, strict=True):
                 parameter.copy_(average)
         return avatar.to(self.device)
 
@@ -213,10 +201,8 @@ class Trainer:
             "seed": self.seed,
             "avatar": self.avatar.to_dict(),
             "training": asdict(self.config),
-            "average": [value.cpu().clone() for value in self.average],
-            "optimizer": self.optimizer.state_dict(),
             "random": torch.get_rng_state(),
-        }
+        } | self.optimizer.state()
 
     def restore(self, state: dict[str, Any], path: str) -> None:
         """Continue from `state`; `path` names the checkpoint in messages.
@@ -238,9 +224,7 @@ class Trainer:
             )
         try:
             self.model.load_state_dict(state["avatar"]["state"])
-            self.optimizer.load_state_dict(state["optimizer"])
-            for mine, saved in zip(self.average, state["average"], strict=True):
-                mine.copy_(saved)
+            self.optimizer.restore(state)
             torch.set_rng_state(state["random"])
             self.step = int(state["step"])
         except (KeyError, RuntimeError, TypeError, ValueError) as error:

@@ -27,6 +27,7 @@ CONFIGS = {
     "small": SMALL,
     "odd": ODD,
     "first": replace(SMALL, condition_layer=0, width=64),
+    "grids": replace(SMALL, width=64, depth=3, feature_cells_m=[0.5, 0.11], features=3),
     "none": replace(PAPER, condition_layer=None, depth=3),
     "narrow": replace(PAPER, width=1, depth=1, skip_layers=[], condition_layer=None),
 }
@@ -36,7 +37,9 @@ def network_of(config: ShapeConfig, dtype=torch.float32) -> OccupancyNetwork:
     torch.manual_seed(3)
     bones = torch.rand(7, 2, 3) - 0.5
     bones[2, 1] = bones[2, 0]  # a bone without length
-    network = OccupancyNetwork(config, 3 * PARTS, bones)
+    network = OccupancyNetwork(config, 3 * PARTS, bones, (torch.full((3,), -1.0), torch.full((3,), 1.1)))
+    if network.grids is not None:
+        network.grids.cover(torch.rand(6, 6, 6) > 0.5)
     for parameter in network.parameters():  # also those that start from zero
         parameter.data += 0.05 * torch.randn_like(parameter)
     return network.to(dtype)

@@ -162,7 +162,7 @@ def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path) -> None:
     while resumed.step < 8:
         resumed.advance()
     resumed.batches.close()
-    for a, b in zip(whole.parameters, resumed.parameters, strict=True):
+    for a, b in zip(whole.optimizer.parameters, resumed.optimizer.parameters, strict=True):
         assert torch.equal(a, b)
     other = Trainer(new_avatar(store), store, training_config(workers=0, steps=8), 0, CPU)
     with pytest.raises(UserError, match=r"training.fresh_points: True there, False here"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import signal
+from dataclasses import replace
 
 import pytest
 import torch
@@ -51,10 +52,13 @@ def test_learns_shape_and_weights(store, tmp_path):
     assert float((inside & truth).sum() / (inside | truth).sum()) > 0.6  # bent further than ever seen
 
 
-@pytest.mark.parametrize(("condition", "interrupted_at"), [("global", 7), ("local", 10)])
-def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path, condition, interrupted_at):
-    # The searched cells change before the interruption and after it, at step 10 as the first thing.
+@pytest.mark.parametrize(
+    ("condition", "feature_cells_m", "interrupted_at"), [("global", [], 7), ("local", [], 10), ("local", [0.2, 0.1], 7)]
+)
+def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path, condition, feature_cells_m, interrupted_at):
+    # The searched cells, and the feature grids, change before the interruption and after it, at step 10 as the first thing.
     config, architecture = training_config(steps=12, refresh_cells_every=5), avatar_config(condition=condition)
+    architecture = replace(architecture, shape=replace(architecture.shape, feature_cells_m=feature_cells_m))
 
     def fresh():
         torch.manual_seed(0)
@@ -73,7 +77,11 @@ def test_resumed_training_equals_an_uninterrupted_one(store, tmp_path, condition
     assert second.step == interrupted_at
     for _ in range(12 - interrupted_at):
         second.advance()
-    for mine, theirs in zip(second.parameters + second.average, whole.parameters + whole.average, strict=True):
+    for mine, theirs in zip(
+        second.optimizer.parameters + second.optimizer.average,
+        whole.optimizer.parameters + whole.optimizer.average,
+        strict=True,
+    ):
         assert torch.equal(mine, theirs)
     cells = [trainer.model.deformer.active_cells for trainer in (second, whole)]
     assert torch.equal(*cells)

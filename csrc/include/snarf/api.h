@@ -16,7 +16,7 @@
 extern "C" {
 #endif
 
-#define SNARF_ABI_VERSION 2
+#define SNARF_ABI_VERSION 3
 
 enum { SNARF_OK = 0, SNARF_BAD_ARGUMENT = 1, SNARF_OUT_OF_MEMORY = 2 };
 
@@ -72,18 +72,55 @@ typedef struct snarf_layer {
   int32_t activation; /* 0: none, 1: ReLU, 2: softplus */
 } snarf_layer;
 
+/* A level of feature grids over a box. */
+typedef struct snarf_feature_level {
+  float lower[3];      /* of the first node, metres */
+  float size[3];       /* sides of a cell, metres */
+  int32_t nodes[3];    /* W, H, D */
+  const int32_t* rows; /* row of each node's features in the table, [D, H, W]; -1: zeros */
+} snarf_feature_level;
+
 /* A canonical occupancy network (SNARF Eq. 1) in one pose; the last layer has one output. */
 typedef struct snarf_network {
   const snarf_layer* layers;
   int32_t layer_count;
   const float* frequencies; /* radians per metre, [K]: the encoded point is x, sin(k x) for each k, cos(k x) for each k */
   int32_t frequency_count;
+  const snarf_feature_level* levels; /* after the waves, features interpolated at the point join it */
+  int32_t level_count;
+  int32_t features;      /* F, numbers per node */
+  const float* table;    /* [R, F] */
+  int64_t rows;          /* R */
   const float* segments; /* bones, [S, 2, 3], metres */
   int32_t segment_count; /* S; 0 for no capsules */
   float radius, slope;   /* slope * (radius - distance to the nearest bone) is added */
   float sharpness;       /* of the softplus */
   int32_t extra_count;   /* E, values of each point's own */
 } snarf_network;
+
+/* A fully connected network with gradients. The first inputs stand where `snarf_layer` says "encoded point". */
+typedef struct snarf_perceptron {
+  const snarf_layer* layers;
+  int32_t layer_count;
+  int32_t first_count; /* E */
+  int32_t extra_count; /* X */
+  float sharpness;     /* of the softplus */
+  int32_t threads;     /* at most */
+} snarf_perceptron;
+
+/* Points encoded as x, sin(k x) for each k, cos(k x) for each k, then the features of each level, interpolated. */
+typedef struct snarf_encoding {
+  const float* points;      /* [N, 3], metres */
+  int64_t count;            /* N */
+  const float* frequencies; /* radians a metre, [K] */
+  int32_t frequency_count;
+  const snarf_feature_level* levels;
+  int32_t level_count;
+  int32_t features;   /* F, numbers per node */
+  const float* table; /* [R, F] */
+  int64_t rows;       /* R */
+  int32_t threads;    /* at most */
+} snarf_encoding;
 
 typedef struct snarf_roots snarf_roots;
 
@@ -116,6 +153,28 @@ SNARF_API int snarf_implicit_backward(const snarf_field*, const snarf_queries*, 
 /* Logits [N] at points [N, 3], metres, with extras [N, E]; always float. A point's result does not depend on the others. */
 SNARF_API int snarf_evaluate(const snarf_network*, const float* points, const float* extras, int64_t count, int32_t threads,
                              float* logits);
+
+/* Numbers of the activations that `snarf_forward` saves for `count` points; negative for a network that is none. */
+SNARF_API int64_t snarf_saved_size(const snarf_perceptron*, int64_t count);
+/* out [N, O] of first [N, E] and extras [N, X]. */
+SNARF_API int snarf_forward(const snarf_perceptron*, const float* first, const float* extras, int64_t count, float* saved,
+                            float* out);
+/* Gradients of a loss from that by `out`: by each layer's weights and bias, by the first inputs and by the extras (either may
+ * be null). All are overwritten; the results do not depend on the number of threads. */
+SNARF_API int snarf_backward(const snarf_perceptron*, const float* first, const float* extras, int64_t count,
+                             const float* saved, const float* v_out, float* const* v_weights, float* const* v_bias,
+                             float* v_first, float* v_extras);
+
+/* out [N, 3 + 6 K + levels F]. */
+SNARF_API int snarf_encode(const snarf_encoding*, float* out);
+/* Gradients from that by `out`, which is as `snarf_encode` wrote it; either result may be null, both are overwritten. */
+SNARF_API int snarf_encode_backward(const snarf_encoding*, const float* out, const float* v_out, float* v_points,
+                                    float* v_table);
+
+/* Distances [N] of points [N, 3] to the nearest of S >= 1 segments [S, 2, 3], and the unit vectors [N, 3] away from it, which
+ * are the gradients. */
+SNARF_API int snarf_segment_distances(const float* points, int64_t count, const float* segments, int32_t segment_count,
+                                      int32_t threads, float* distance, float* direction);
 
 #ifdef __cplusplus
 }

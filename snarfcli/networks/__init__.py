@@ -1,0 +1,7 @@
+"""Fully connected networks, encodings of points and distances, as torch.library operators with exact gradients."""
+
+from snarfcli.networks.capsules import run_segment_distance
+from snarfcli.networks.encoding import run_encoding
+from snarfcli.networks.perceptron import ACTIVATIONS, run_perceptron
+
+__all__ = ["ACTIVATIONS", "run_encoding", "run_perceptron", "run_segment_distance"]

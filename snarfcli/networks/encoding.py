@@ -1,0 +1,150 @@
+"""Points as coordinates, waves and features of grids: a torch.library operator.
+
+On a CPU the native library evaluates it, forward and backward (csrc/cpu/training.cpp), in float32; everywhere else, and in
+other dtypes, the readable version does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from snarfcli.native import cpu_networks
+from snarfcli.native.backend import choose_backend
+
+__all__ = ["encode", "encode_reference", "run_encoding"]
+
+
+def encode_reference(
+    points: Tensor, frequencies: Tensor, table: Tensor, rows: Tensor, nodes: Sequence[int], boxes: Sequence[float]
+) -> Tensor:
+    """The readable version of `encode`."""
+    angles = (points[:, None] * frequencies[:, None]).flatten(1)
+    parts = [points, angles.sin(), angles.cos()]
+    padded = torch.cat([table, table.new_zeros(1, table.shape[1])])  # row -1: zeros
+    start = 0
+    for level in range(len(nodes) // 3):
+        width, height, depth = nodes[3 * level : 3 * level + 3]
+        lower, size = points.new_tensor(boxes[6 * level : 6 * level + 6]).view(2, 3)
+        place = (points - lower) / size
+        limit = torch.tensor([width - 1, height - 1, depth - 1], device=points.device)
+        is_inside = ((place >= 0) & (place <= limit)).all(1)
+        cell = torch.minimum(place.detach().nan_to_num().clamp_min(0).long(), limit - 1)
+        local = place - cell
+        features = points.new_zeros(len(points), table.shape[1])
+        for corner in range(8):
+            step = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2], device=points.device)
+            share = torch.where(step.bool(), local, 1 - local).prod(1)
+            at = cell + step
+            node = (at[:, 2] * height + at[:, 1]) * width + at[:, 0]
+            features = features + share[:, None] * padded[rows[start + node].long()]
+        parts.append(torch.where(is_inside[:, None], features, torch.zeros_like(features)))
+        start += width * height * depth
+    return torch.cat(parts, 1)
+
+
+def run_encoding(
+    points: Tensor,
+    frequencies: Tensor,
+    table: Tensor | None = None,
+    rows: Tensor | None = None,
+    nodes: Sequence[int] = (),
+    boxes: Sequence[float] = (),
+) -> Tensor:
+    """Encode points with gradients: by the native operator in float32 on a CPU, else by PyTorch.
+
+    Arguments and result: as those of `encode`; without a table there are no grids.
+    """
+    table = points.new_empty(0, 1) if table is None else table
+    rows = torch.empty(0, dtype=torch.int32, device=points.device) if rows is None else rows
+    is_native = points.device.type == "cpu" and points.dtype == table.dtype == torch.float32
+    run = encode if is_native and choose_backend("auto") == "native" else encode_reference
+    return run(points, frequencies, table, rows, list(nodes), list(boxes))
+
+
+@torch.library.custom_op("snarf::encode", mutates_args=())
+def encode(
+    points: Tensor, frequencies: Tensor, table: Tensor, rows: Tensor, nodes: Sequence[int], boxes: Sequence[float]
+) -> Tensor:
+    """Encode points as coordinates, waves, and features interpolated in grids of several resolutions.
+
+    Args:
+        points: [N, 3], metres.
+        frequencies: [K], radians per metre.
+        table: [R, F], features.
+        rows: row of each node's features, int32, the [D, H, W] nodes of all levels one after the other; -1 for zeros.
+        nodes: W, H, D of each level.
+        boxes: position of the first node and sides of a cell of each level, six numbers in metres.
+
+    Returns:
+        [N, 3 + 6 K + levels F]: x, sin(k x) for each k, cos(k x) for each k, features; outside of a level's box zeros.
+
+    Source: features after Mueller et al., Instant Neural Graphics Primitives, SIGGRAPH 2022, Sec. 3, on dense grids.
+    """
+    return encode_reference(points, frequencies, table, rows, nodes, boxes)
+
+
+@encode.register_kernel("cpu")
+def _(points, frequencies, table, rows, nodes, boxes):
+    if points.dtype == torch.float32 and choose_backend("auto") == "native":
+        return cpu_networks.encode(points, frequencies, table, rows, nodes, boxes)
+    return encode_reference(points, frequencies, table, rows, nodes, boxes)
+
+
+@encode.register_fake
+def _(points, frequencies, table, rows, nodes, boxes):
+    return points.new_empty(len(points), 3 + 6 * len(frequencies) + len(nodes) // 3 * table.shape[1])
+
+
+def _encode_backward_reference(gradient, points, frequencies, table, rows, nodes, boxes, wants):
+    back = torch.func.vjp(lambda p, t: encode_reference(p, frequencies, t, rows, nodes, boxes), points, table)[1]
+    v_points, v_table = back(gradient)
+    return v_points if wants[0] else points.new_empty(0), v_table if wants[1] else points.new_empty(0)
+
+
+@torch.library.custom_op("snarf::encode_backward", mutates_args=())
+def encode_backward(
+    gradient: Tensor,
+    encoded: Tensor,
+    points: Tensor,
+    frequencies: Tensor,
+    table: Tensor,
+    rows: Tensor,
+    nodes: Sequence[int],
+    boxes: Sequence[float],
+    wants_points: bool,
+    wants_table: bool,
+) -> tuple[Tensor, Tensor]:
+    """Return the gradients of a loss by the points and by the features (empty where not wanted), from that by the encoding."""
+    return _encode_backward_reference(gradient, points, frequencies, table, rows, nodes, boxes, (wants_points, wants_table))
+
+
+@encode_backward.register_kernel("cpu")
+def _(gradient, encoded, points, frequencies, table, rows, nodes, boxes, wants_points, wants_table):
+    if points.dtype == torch.float32 and choose_backend("auto") == "native":
+        return cpu_networks.encode_backward(
+            gradient, encoded, points, frequencies, table, rows, nodes, boxes, wants_points, wants_table
+        )
+    return _encode_backward_reference(gradient, points, frequencies, table, rows, nodes, boxes, (wants_points, wants_table))
+
+
+@encode_backward.register_fake
+def _(gradient, encoded, points, frequencies, table, rows, nodes, boxes, wants_points, wants_table):
+    v_points = torch.empty_like(points) if wants_points else points.new_empty(0)
+    return v_points, torch.empty_like(table) if wants_table else points.new_empty(0)
+
+
+def _encode_context(ctx, inputs, output):
+    points, frequencies, table, rows, ctx.nodes, ctx.boxes = inputs
+    ctx.save_for_backward(output, points, frequencies, table, rows)
+
+
+def _encode_gradient(ctx, gradient):
+    wants = ctx.needs_input_grad[0], ctx.needs_input_grad[2]
+    v_points, v_table = encode_backward(gradient, *ctx.saved_tensors, ctx.nodes, ctx.boxes, *wants)
+    return v_points if wants[0] else None, None, v_table if wants[1] else None, None, None, None
+
+
+encode.register_autograd(_encode_gradient, setup_context=_encode_context)

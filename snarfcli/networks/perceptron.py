@@ -20,6 +20,8 @@ __all__ = ["ACTIVATIONS", "perceptron", "perceptron_reference", "run_perceptron"
 ACTIVATIONS = {"relu": 1, "softplus": 2}
 """Numbers of the activations in the native library."""
 
+_WIDE = 96  # layers of 64 are faster natively also where PyTorch multiplies in bfloat16 (benchmarks/bm_training.py)
+
 
 def perceptron_reference(
     first: Tensor,
@@ -39,7 +41,10 @@ def perceptron_reference(
             parts.append(first)
         if takes_extras[index] and extras is not None:
             parts.append(extras)
-        h = F.linear(torch.cat(parts, 1), weight, bias)
+        blocks = weight.split([part.shape[1] for part in parts], 1)
+        h = F.linear(parts[0], blocks[0], bias)  # a sum of products: joining wide inputs takes longer
+        for part, block in zip(parts[1:], blocks[1:], strict=True):
+            h = h + part @ block.T
         if index + 1 < len(weights):
             h = F.relu(h) if activation == ACTIVATIONS["relu"] else F.softplus(h, beta=sharpness)
     assert h is not None
@@ -58,12 +63,23 @@ def run_perceptron(
 ) -> Tensor:
     """Evaluate a network with gradients: by the native operator in float32 on a CPU, else layer by layer in PyTorch.
 
+    Wide layers are left to PyTorch where lower precision is allowed and the processor multiplies bfloat16 numbers.
+
     Arguments and result: as those of `perceptron`.
     """
     settings = (takes_first, takes_extras, activation, sharpness)
-    if first.device.type == "cpu" and first.dtype == weights[0].dtype == torch.float32 and choose_backend("auto") == "native":
+    is_float32_on_cpu = first.device.type == "cpu" and first.dtype == weights[0].dtype == torch.float32
+    if is_float32_on_cpu and not _is_faster_in_pytorch(weights) and choose_backend("auto") == "native":
         return perceptron(first, extras, list(weights), list(biases), *settings)[0]
     return perceptron_reference(first, extras, weights, biases, *settings)
+
+
+def _is_faster_in_pytorch(weights: Sequence[Tensor]) -> bool:
+    """Return whether PyTorch multiplies in bfloat16: a step with layers of 128 then takes three quarters of the native time."""
+    if torch.get_float32_matmul_precision() == "highest" or max(len(weight) for weight in weights) < _WIDE:
+        return False
+    is_supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)  # no public name
+    return is_supported is not None and bool(is_supported())
 
 
 @torch.library.custom_op("snarf::perceptron", mutates_args=())

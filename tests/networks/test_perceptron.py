@@ -11,7 +11,14 @@ import pytest
 import torch
 
 from snarfcli.native.library import native_library
-from snarfcli.networks.perceptron import ACTIVATIONS, perceptron, perceptron_backward, perceptron_reference
+from snarfcli.networks.perceptron import (
+    ACTIVATIONS,
+    perceptron,
+    perceptron_backward,
+    perceptron_reference,
+    run_perceptron,
+)
+from snarfcli.precision import matmul_precision
 
 TILE = 128  # csrc/cpu/network_task.h
 
@@ -165,3 +172,14 @@ def test_every_instruction_set_gives_the_same(wanted):
         gradient = torch.randn(200, NETWORKS[name][4], generator=torch.Generator().manual_seed(1))
         out, gradients = outputs_and_gradients(perceptron_reference, made(name, 200, torch.float64), gradient)
         assert values == pytest.approx([float(out.detach().sum()), *(float(g.norm()) for g in gradients)], rel=2e-5, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("precision", "width", "is_native"), [("highest", 128, True), ("medium", 128, False), ("medium", 64, True)]
+)
+def test_wide_layers_are_left_to_pytorch_where_it_multiplies_in_bfloat16(monkeypatch, precision, width, is_native):
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True, raising=False)
+    weights = [torch.rand(width, 3, requires_grad=True), torch.rand(1, width)]
+    with matmul_precision(precision):
+        out = run_perceptron(torch.rand(4, 3), None, weights, [torch.zeros(width), torch.zeros(1)], [1, 0], [0, 0], 1, 100.0)
+    assert ("snarf_perceptron" in type(out.grad_fn).__name__) == is_native

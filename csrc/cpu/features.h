@@ -1,6 +1,10 @@
 // Features at the nodes of grids, interpolated at points (snarfcli/shape/features.py).
 #pragma once
 
+#include <string.h>
+
+#include <type_traits>
+
 #include "lanes.h"
 #include "network_task.h"
 
@@ -8,24 +12,52 @@ namespace snarf {
 namespace SNARF_ISA {
 namespace {
 
-// The cell of a level that a point lies in: rows of the features at its corners, and the point's place between them.
+// The cell of a level that a point lies in: rows of the features at its corners, kNoRow where there are none, and the point's
+// place between them.
 struct Place {
-  int32_t row[8];
+  uint32_t row[8];
   float local[3];
+  bool is_inside;
 };
 
-SNARF_HD bool find_place(const FeatureLevel& level, const float* point, Place& place) {
+constexpr uint32_t kNoRow = 0xffffffffu;
+constexpr int kPlaces = 32;  // found at once, so that the features of many points are on their way from memory
+
+SNARF_HD void find_place(const FeatureLevel& level, const float* point, Place& place) {
   int cell[3];
+  place.is_inside = false;
   for (int axis = 0; axis < 3; ++axis) {
     const float at = (point[axis] - level.lower[axis]) * level.per_metre[axis];
-    if (!(at >= 0.f && at <= float(level.nodes[axis] - 1))) return false;
+    if (!(at >= 0.f && at <= float(level.nodes[axis] - 1))) return;
     cell[axis] = int(at) < level.nodes[axis] - 2 ? int(at) : level.nodes[axis] - 2;
     place.local[axis] = at - float(cell[axis]);
   }
+  place.is_inside = true;
   const int64_t width = level.nodes[0], layer = width * level.nodes[1];
   const int32_t* const rows = level.rows + cell[2] * layer + cell[1] * width + cell[0];
-  for (int k = 0; k < 8; ++k) place.row[k] = rows[(k >> 2) * layer + (k >> 1 & 1) * width + (k & 1)];
-  return true;
+  for (int k = 0; k < 8; ++k) {
+    const uint32_t row = uint32_t(rows[(k >> 2) * layer + (k >> 1 & 1) * width + (k & 1)]);
+    place.row[k] = row < level.row_count ? row : kNoRow;
+  }
+}
+
+// Calls use(i, place) for each i < count with the place of points[3 * i]. Asks for the rows of `table` early.
+template <class Use>
+SNARF_HD void for_places(const FeatureLevel& level, const float* points, int64_t count, const float* table, int features,
+                         const Use& use) {
+  Place places[kPlaces];
+  for (int64_t first = 0; first < count; first += kPlaces) {
+    const int here = int(count - first < kPlaces ? count - first : kPlaces);
+    for (int i = 0; i < here; ++i) {
+      find_place(level, points + 3 * (first + i), places[i]);
+#if defined(__GNUC__)
+      if (places[i].is_inside)
+        for (int k = 0; k < 8; k += 2)  // neighbours along x mostly share a line of the cache
+          if (places[i].row[k] != kNoRow) __builtin_prefetch(table + int64_t(places[i].row[k]) * features);
+#endif
+    }
+    for (int i = 0; i < here; ++i) use(first + i, places[i]);
+  }
 }
 
 // Trilinear weights of the eight corners.
@@ -38,30 +70,83 @@ SNARF_HD void corner_weights(const Place& place, float* weights) {
   }
 }
 
-// F numbers per node where that is known when this is compiled, else 0.
-template <int F>
-SNARF_HD void interpolate(const float* table, int count, const FeatureLevel& level, const float* point, float* out) {
-  const int features = F ? F : count;
-  for (int f = 0; f < features; ++f) out[f] = 0.f;
-  Place place;
-  if (!find_place(level, point, place)) return;
-  float weights[8];
-  corner_weights(place, weights);
-  for (int k = 0; k < 8; ++k) {
-    if (place.row[k] < 0) continue;
-    const float* const row = table + int64_t(place.row[k]) * features;
-    for (int f = 0; f < features; ++f) out[f] += weights[k] * row[f];
-  }
+// Calls block(first, F) for blocks of F = 8, 4 and 1 features that make up `count`. Their numbers stay in registers.
+template <class Block>
+SNARF_HD void for_blocks(int count, const Block& block) {
+  int first = 0;
+  for (; first + 8 <= count; first += 8) block(first, std::integral_constant<int, 8>());
+  for (; first + 4 <= count; first += 4) block(first, std::integral_constant<int, 4>());
+  for (; first < count; ++first) block(first, std::integral_constant<int, 1>());
 }
 
-SNARF_HD void interpolate(const float* table, int count, const FeatureLevel& level, const float* point, float* out) {
-  if (count == 4) {
-    interpolate<4>(table, count, level, point, out);
-  } else if (count == 2) {
-    interpolate<2>(table, count, level, point, out);
-  } else {
-    interpolate<0>(table, count, level, point, out);
+// out[count]: the features at a point, zeros outside of the level.
+SNARF_HD void interpolate(const float* table, int count, const Place& place, float* out) {
+  if (!place.is_inside) {
+    for (int f = 0; f < count; ++f) out[f] = 0.f;
+    return;
   }
+  float weights[8];
+  corner_weights(place, weights);
+  for_blocks(count, [&](int first, auto features) {
+    constexpr int F = decltype(features)::value;
+    float sum[F] = {};
+    for (int k = 0; k < 8; ++k) {
+      if (place.row[k] == kNoRow) continue;
+      const float* const row = table + int64_t(place.row[k]) * count + first;
+      for (int f = 0; f < F; ++f) sum[f] += weights[k] * row[f];
+    }
+    memcpy(out + first, sum, sizeof sum);
+  });
+}
+
+// Adds the gradients by the features of the corners to v_table, from given[count], that by the features at the point.
+SNARF_HD void spread(float* v_table, int count, const Place& place, const float* given) {
+  if (!place.is_inside) return;
+  float weights[8];
+  corner_weights(place, weights);
+  for_blocks(count, [&](int first, auto features) {
+    constexpr int F = decltype(features)::value;
+    float gradient[F];
+    memcpy(gradient, given + first, sizeof gradient);
+    for (int k = 0; k < 8; ++k) {
+      if (place.row[k] == kNoRow) continue;
+      float* const row = v_table + int64_t(place.row[k]) * count + first;
+      float sum[F];
+      memcpy(sum, row, sizeof sum);
+      for (int f = 0; f < F; ++f) sum[f] += weights[k] * gradient[f];
+      memcpy(row, sum, sizeof sum);
+    }
+  });
+}
+
+// Adds the gradient by the point to total[3], from given[count].
+SNARF_HD void add_slope(const float* table, int count, const FeatureLevel& level, const Place& place, const float* given,
+                        float* total) {
+  if (!place.is_inside) return;
+  float along[8] = {};  // the gradient's product with each corner's features, which is interpolated as they are
+  for_blocks(count, [&](int first, auto features) {
+    constexpr int F = decltype(features)::value;
+    float gradient[F];
+    memcpy(gradient, given + first, sizeof gradient);
+    for (int k = 0; k < 8; ++k) {
+      if (place.row[k] == kNoRow) continue;
+      const float* const row = table + int64_t(place.row[k]) * count + first;
+      float product[F];
+      for (int f = 0; f < F; ++f) product[f] = gradient[f] * row[f];
+      for (int f = 0; f < F; ++f) along[k] += product[f];
+    }
+  });
+  const float x = place.local[0], y = place.local[1], z = place.local[2];
+  float edge[4], rise[4];  // between and along the edges in x
+  for (int k = 0; k < 4; ++k) {
+    rise[k] = along[2 * k + 1] - along[2 * k];
+    edge[k] = along[2 * k] + x * rise[k];
+  }
+  const float low = rise[0] + y * (rise[1] - rise[0]), high = rise[2] + y * (rise[3] - rise[2]);
+  const float front = edge[1] - edge[0], back = edge[3] - edge[2];
+  total[0] += level.per_metre[0] * (low + z * (high - low));
+  total[1] += level.per_metre[1] * (front + z * (back - front));
+  total[2] += level.per_metre[2] * (edge[2] + y * back - edge[0] - y * front);
 }
 
 }  // namespace

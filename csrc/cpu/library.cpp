@@ -241,3 +241,8 @@ int snarf_segment_distances(const float* points, int64_t count, const float* seg
   const DistanceTask task = {points, segments, segment_count, distance, direction};
   return in_number_type(4, [&](auto) { distances(task, count, threads); });
 }
+
+int snarf_adam_step(const snarf_parameters* arrays, int32_t count, const snarf_adam* settings, double* magnitude) {
+  if (!valid(arrays, count, settings) || !magnitude) return SNARF_BAD_ARGUMENT;
+  return in_number_type(4, [&](auto) { *magnitude = adam_step(arrays, count, *settings); });
+}

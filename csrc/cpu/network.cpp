@@ -27,14 +27,15 @@ void encode(const NetworkTask& task, const float* points, float* encoded) {
 
 // Features of each level, after what `encode` wrote.
 void add_features(const NetworkTask& task, const float* points, float* encoded) {
-  float values[kMostFeatures];
+  float values[kMostFeatures], places[3 * kTile];
+  for (int i = 0; i < kTile; ++i)
+    for (int axis = 0; axis < 3; ++axis) places[3 * i + axis] = points[axis * kTile + i];
   float* rows = encoded + int64_t(kTile) * (3 + 6 * task.frequency_count);
   for (int l = 0; l < task.level_count; ++l, rows += int64_t(kTile) * task.features)
-    for (int i = 0; i < kTile; ++i) {
-      const float point[3] = {points[i], points[kTile + i], points[2 * kTile + i]};
-      interpolate(task.table, task.features, task.levels[l], point, values);
+    for_places(task.levels[l], places, kTile, task.table, task.features, [&](int64_t i, const Place& place) {
+      interpolate(task.table, task.features, place, values);
       for (int f = 0; f < task.features; ++f) rows[f * kTile + i] = values[f];
-    }
+    });
 }
 
 // Adds to `values` [kTile] the logits of capsules around the bones, as OccupancyNetwork does. `points` is [3, kTile].

@@ -56,7 +56,7 @@ class Network {
     task_.slope = network.slope;
     task_.sharpness = network.sharpness;
     task_.extra_count = network.extra_count;
-    for (int l = 0; l < network.level_count; ++l) levels_.push_back(feature_level(network.levels[l]));
+    for (int l = 0; l < network.level_count; ++l) levels_.push_back(feature_level(network.levels[l], network.rows));
     task_.levels = levels_.data();
     task_.widest = 0;
     int hidden = 0;

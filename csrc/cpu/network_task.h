@@ -24,7 +24,8 @@ struct FeatureLevel {
   float lower[3];       // of the first node, metres
   float per_metre[3];   // cells per metre
   int32_t nodes[3];     // W, H, D
-  const int32_t* rows;  // row of each node's features, [D, H, W]; -1: it has none, which counts as zeros
+  const int32_t* rows;  // row of each node's features, [D, H, W]; nodes with a row that does not exist, as -1, count as zeros
+  uint32_t row_count;   // R, rows of the table
 };
 
 struct NetworkTask {

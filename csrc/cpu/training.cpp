@@ -7,6 +7,7 @@
 #include "capsules.h"
 #include "features.h"
 #include "layer.h"
+#include "optimizer.h"
 #include "training_task.h"
 
 namespace snarf {
@@ -235,47 +236,6 @@ void backward(const TrainingTask& task, int64_t first, int64_t last, float* scra
 }
 
 // ---------------------------------------------------------------- encoding
-template <int F>
-SNARF_HD void spread(const EncodingTask& task, const FeatureLevel& level, const float* point, const float* given) {
-  const int features = F ? F : task.features;
-  Place place;
-  if (!find_place(level, point, place)) return;
-  float weights[8];
-  corner_weights(place, weights);
-  for (int k = 0; k < 8; ++k) {
-    if (place.row[k] < 0) continue;
-    float* const row = task.v_table + int64_t(place.row[k]) * features;
-    for (int f = 0; f < features; ++f) row[f] += weights[k] * given[f];
-  }
-}
-
-// Adds the gradient by the point to total[3].
-template <int F>
-SNARF_HD void slope_of_features(const EncodingTask& task, const FeatureLevel& level, const float* point, const float* given,
-                                float* total) {
-  const int features = F ? F : task.features;
-  Place place;
-  if (!find_place(level, point, place)) return;
-  float along[8];  // the gradient's product with each corner's features, which is interpolated as they are
-  for (int k = 0; k < 8; ++k) {
-    along[k] = 0.f;
-    if (place.row[k] < 0) continue;
-    const float* const row = task.table + int64_t(place.row[k]) * features;
-    for (int f = 0; f < features; ++f) along[k] += given[f] * row[f];
-  }
-  const float x = place.local[0], y = place.local[1], z = place.local[2];
-  float edge[4], rise[4];  // between and along the edges in x
-  for (int k = 0; k < 4; ++k) {
-    rise[k] = along[2 * k + 1] - along[2 * k];
-    edge[k] = along[2 * k] + x * rise[k];
-  }
-  const float low = rise[0] + y * (rise[1] - rise[0]), high = rise[2] + y * (rise[3] - rise[2]);
-  const float front = edge[1] - edge[0], back = edge[3] - edge[2];
-  total[0] += level.per_metre[0] * (low + z * (high - low));
-  total[1] += level.per_metre[1] * (front + z * (back - front));
-  total[2] += level.per_metre[2] * (edge[2] + y * back - edge[0] - y * front);
-}
-
 void encode(const EncodingTask& task, int64_t first, int64_t last) {
   const int waves = 3 * task.frequency_count, features = task.features, size = task.size();
   for (int64_t n = first; n < last; n += L) {
@@ -297,11 +257,9 @@ void encode(const EncodingTask& task, int64_t first, int64_t last) {
     }
   }
   for (int l = 0; l < task.level_count; ++l) {
-    float* out = task.out + first * size + 3 + 2 * waves + l * features;
-    for (int64_t n = first; n < last; ++n, out += size) {
-      const float* const point = task.points + 3 * n;
-      interpolate(task.table, features, task.levels[l], point, out);
-    }
+    float* const out = task.out + first * size + 3 + 2 * waves + l * features;
+    for_places(task.levels[l], task.points + 3 * first, last - first, task.table, features,
+               [&](int64_t n, const Place& place) { interpolate(task.table, features, place, out + n * size); });
   }
 }
 
@@ -318,31 +276,21 @@ void encode_points(const EncodingTask& task, int64_t first, int64_t last) {
         total[axis] += task.frequencies[f] * (v[sine] * value[cosine] - v[cosine] * value[sine]);
       }
     }
-    for (int l = 0; l < task.level_count; ++l) {
-      const float *const given = v + 3 + 2 * waves + l * features, *const point = task.points + 3 * n;
-      if (features == 4)
-        slope_of_features<4>(task, task.levels[l], point, given, total);
-      else if (features == 2)
-        slope_of_features<2>(task, task.levels[l], point, given, total);
-      else
-        slope_of_features<0>(task, task.levels[l], point, given, total);
-    }
     for (int axis = 0; axis < 3; ++axis) task.v_points[3 * n + axis] = total[axis];
+  }
+  for (int l = 0; l < task.level_count; ++l) {
+    const float* const given = task.v_out + first * size + 3 + 2 * waves + l * features;
+    for_places(task.levels[l], task.points + 3 * first, last - first, task.table, features, [&](int64_t n, const Place& place) {
+      add_slope(task.table, features, task.levels[l], place, given + n * size, task.v_points + 3 * (first + n));
+    });
   }
 }
 
 void encode_level(const EncodingTask& task, int32_t level) {
   const int features = task.features, size = task.size();
-  const float* given = task.v_out + 3 + 6 * task.frequency_count + level * features;
-  for (int64_t n = 0; n < task.count; ++n, given += size) {
-    const float* const point = task.points + 3 * n;
-    if (features == 4)
-      spread<4>(task, task.levels[level], point, given);
-    else if (features == 2)
-      spread<2>(task, task.levels[level], point, given);
-    else
-      spread<0>(task, task.levels[level], point, given);
-  }
+  const float* const given = task.v_out + 3 + 6 * task.frequency_count + level * features;
+  for_places(task.levels[level], task.points, task.count, task.v_table, features,
+             [&](int64_t n, const Place& place) { spread(task.v_table, features, place, given + n * size); });
 }
 
 // ---------------------------------------------------------------- capsules
@@ -367,7 +315,9 @@ void distances(const DistanceTask& task, int64_t first, int64_t last) {
 
 }  // namespace
 
-TrainingKernels training_kernels() { return {forward, backward, encode, encode_points, encode_level, distances}; }
+TrainingKernels training_kernels() {
+  return {forward, backward, encode, encode_points, encode_level, distances, adam, magnitude};
+}
 
 }  // namespace SNARF_ISA
 }  // namespace snarf

@@ -2,9 +2,11 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <new>
+#include <numeric>
 #include <vector>
 
 #include "dispatch.h"
@@ -18,6 +20,7 @@ namespace snarf {
 constexpr int64_t kTilesPerThread = 2;         // fewer are not worth starting a thread for
 constexpr int64_t kEncodedPerThread = 512;     // points
 constexpr int64_t kColumnUnit = 16;            // a pack of the widest instruction set
+constexpr int64_t kNumbersAtOnce = 1 << 14;    // parameters in one piece of work
 constexpr int64_t kGradientNumbers = 1 << 21;  // of all chunks together, at most
 
 inline TrainingKernels training_kernels() {
@@ -195,7 +198,7 @@ class Encoding {
     task_.level_count = encoding.level_count;
     task_.features = encoding.level_count ? encoding.features : 0;
     task_.table = encoding.table;
-    for (int l = 0; l < encoding.level_count; ++l) levels_.push_back(feature_level(encoding.levels[l]));
+    for (int l = 0; l < encoding.level_count; ++l) levels_.push_back(feature_level(encoding.levels[l], encoding.rows));
     task_.levels = levels_.data();
     threads_ = int(std::max<int64_t>(1, std::min<int64_t>(encoding.threads, encoding.count / kEncodedPerThread)));
   }
@@ -242,6 +245,66 @@ inline void distances(const DistanceTask& task, int64_t count, int threads) {
                                    training_kernels().distances(task, begin, end);
                                }});
   if (!well) throw std::bad_alloc();
+}
+
+inline bool valid(const snarf_parameters* arrays, int32_t count, const snarf_adam* settings) {
+  if (count < 0 || (count && !arrays) || !settings || settings->threads < 1 || settings->step < 1) return false;
+  for (int n = 0; n < count; ++n) {
+    const snarf_parameters& array = arrays[n];
+    if (array.rows < 0 || array.columns < 1) return false;
+    if (array.rows && !(array.values && array.gradient && array.first && array.second && array.average)) return false;
+  }
+  return true;
+}
+
+// Returns the sum of the magnitudes of all gradients; nothing changes if it is not finite.
+inline double adam_step(const snarf_parameters* given, int32_t count, const snarf_adam& settings) {
+  struct Part {
+    int32_t array;
+    int64_t first, last;  // rows
+  };
+  std::vector<ParameterArray> arrays;
+  std::vector<Part> parts;
+  for (int32_t n = 0; n < count; ++n) {
+    const snarf_parameters& array = given[n];
+    arrays.push_back({array.values, array.gradient, array.first, array.second, array.average, array.rows, array.columns,
+                      array.rate, array.skips_untouched});
+    const int64_t grain = std::max<int64_t>(1, kNumbersAtOnce / array.columns);
+    for (int64_t first = 0; first < array.rows; first += grain)
+      parts.push_back({n, first, std::min(first + grain, array.rows)});
+  }
+  AdamTask task;
+  task.first_decay = settings.first_decay;
+  task.second_decay = settings.second_decay;
+  task.epsilon = settings.epsilon;
+  task.average_decay = settings.average_decay;
+  task.rate_correction = float(1 / (1 - std::pow(double(settings.first_decay), double(settings.step))));
+  task.root_correction = float(1 / std::sqrt(1 - std::pow(double(settings.second_decay), double(settings.step))));
+  const TrainingKernels kernels = training_kernels();
+  std::vector<double> magnitudes(parts.size());
+  double total = 0;
+  Queue gradients(int64_t(parts.size()), 1), updates(int64_t(parts.size()), 1);
+  const int threads = int(std::max<int64_t>(1, std::min<int64_t>(settings.threads, int64_t(parts.size()) / 4)));
+  const auto measure = [&](int) {
+    for (int64_t n, end; gradients.take(n, end);) {
+      const Part& part = parts[size_t(n)];
+      const ParameterArray& array = arrays[size_t(part.array)];
+      magnitudes[size_t(n)] =
+          kernels.magnitude(array.gradient + part.first * array.columns, (part.last - part.first) * array.columns);
+    }
+  };
+  const auto add_up = [&](int thread) {
+    if (thread == 0) total = std::accumulate(magnitudes.begin(), magnitudes.end(), 0.0);
+  };
+  const auto update = [&](int) {
+    if (!std::isfinite(total)) return;
+    for (int64_t n, end; updates.take(n, end);) {
+      const Part& part = parts[size_t(n)];
+      kernels.adam(task, arrays[size_t(part.array)], part.first, part.last);
+    }
+  };
+  if (!run_phases(threads, {measure, add_up, update})) throw std::bad_alloc();
+  return total;
 }
 
 }  // namespace snarf

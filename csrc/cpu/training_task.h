@@ -66,6 +66,22 @@ struct DistanceTask {
   float* direction;  // [N, 3], unit vectors away from the nearest segment: the gradient
 };
 
+// Parameters [rows, columns] with their gradient, Adam's moments and their moving average, all of the same size.
+struct ParameterArray {
+  float* values;
+  const float* gradient;
+  float *first, *second, *average;
+  int64_t rows, columns;
+  float rate;
+  int32_t skips_untouched;  // whether rows without a gradient keep their values and moments
+};
+
+struct AdamTask {
+  float first_decay, second_decay, epsilon;
+  float rate_correction, root_correction;  // 1 / (1 - first_decay^t) and 1 / sqrt(1 - second_decay^t)
+  float average_decay;
+};
+
 struct TrainingKernels {
   // Tiles first to last.
   void (*forward)(const TrainingTask&, int64_t first, int64_t last, float* scratch);
@@ -79,6 +95,9 @@ struct TrainingKernels {
   void (*encode_level)(const EncodingTask&, int32_t level);
   // Points first to last.
   void (*distances)(const DistanceTask&, int64_t first, int64_t last);
+  // Rows first to last.
+  void (*adam)(const AdamTask&, const ParameterArray&, int64_t first, int64_t last);
+  double (*magnitude)(const float* gradient, int64_t count);
 };
 
 namespace avx512 {

@@ -280,11 +280,14 @@ def _save_for_backward(ctx, inputs, output, lower: int) -> None:
     canonical, query, jacobian_inverse, _ = output
     ctx.save_for_backward(canonical, query, jacobian_inverse, inputs[lower], inputs[lower + 1])
     ctx.mark_non_differentiable(query, jacobian_inverse, output[3])
+    ctx.set_materialize_grads(False)
     ctx.shape, ctx.backend, ctx.size = inputs[lower + 2], backend, points.shape[:2]
     ctx.inputs = len(inputs)
 
 
 def _backward(ctx, gradient, *_):
+    if gradient is None:
+        return (None,) * ctx.inputs
     canonical, query, jacobian_inverse, lower, upper = ctx.saved_tensors
     wants = ctx.needs_input_grad[0], ctx.needs_input_grad[1]
     v_points, v_transforms = implicit_backward(

@@ -91,8 +91,11 @@ class FastSnarf(System):
         self.register_buffer("_canonical_pose", skeleton.canonical_pose.float(), persistent=False)
         self._body_cells: Tensor | None = None
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
-        weights = self.deformer.node_weights()
+    def node_weights(self) -> NodeWeights | None:
+        return self.deformer.node_weights()
+
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
+        weights = self.node_weights() if weights is None else weights
         return FoundRoots(self.deformer(points, bone_transforms, weights=weights), weights)
 
     def shape_at(self, found: FoundRoots, pose: Tensor, precision: str = "highest") -> FieldSamples:
@@ -203,11 +206,14 @@ class FastSnarf(System):
         return {"smoothness": smoothness * self.deformer.smoothness()} if smoothness > 0 else {}
 
     @torch.no_grad()
-    def far_points(self, count: int, bone_transforms: Tensor, generator: torch.Generator) -> Tensor:
+    def far_points(
+        self, count: int, bone_transforms: Tensor, generator: torch.Generator, weights: NodeWeights | None = None
+    ) -> Tensor:
         """Return random points of the searched cells, moved by the poses."""
         canonical = self.deformer.random_canonical(count, generator)
-        weights = self.deformer.field(canonical)  # not interpolated on the grid, which would evaluate all its nodes
-        blended = torch.einsum("nj,bjrc->bnrc", weights, bone_transforms[:, :, :3])
+        # without weights not interpolated on the grid, which would evaluate all its nodes
+        chosen = self.deformer.field(canonical) if weights is None else weights.at(canonical)
+        blended = torch.einsum("nj,bjrc->bnrc", chosen, bone_transforms[:, :, :3])
         return (blended[..., :3] * canonical[:, None]).sum(-1) + blended[..., 3]
 
     def freeze(self) -> None:

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.bodies.kinematics import invert_rigid
-from snarfcli.deformer import CanonicalGrid
+from snarfcli.deformer import CanonicalGrid, NodeWeights
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
@@ -89,7 +89,7 @@ class Nasa(PointwiseSystem):
     def _make_shape(self, bones: Tensor, box: tuple[Tensor, Tensor]) -> PartNetworks:
         return PartNetworks(self.config.model, self.num_bones)
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
         return self._bone_frames(points, bone_transforms)
 
     def shape_at(self, found: BoneFrames, pose: Tensor, precision: str = "highest") -> FieldSamples:

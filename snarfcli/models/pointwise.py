@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
-from snarfcli.deformer import CanonicalGrid
+from snarfcli.deformer import CanonicalGrid, NodeWeights
 from snarfcli.models.extent import bone_segments
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import FieldSamples, Found, System
@@ -74,7 +74,7 @@ class PointwiseSystem(System):
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         """Build the parts of the system besides its shape; the arguments are those of the constructor."""
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
         with matmul_precision("highest"), torch.autocast(points.device.type, enabled=False):
             return FoundPoints(*self.canonical_points(points, bone_transforms, pose))
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from snarfcli.bodies import Skeleton
-from snarfcli.deformer import CanonicalGrid, SearchConfig
+from snarfcli.deformer import CanonicalGrid, NodeWeights, SearchConfig
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.precision import network_precision
@@ -116,8 +116,16 @@ class System(nn.Module):
         """
         return self.shape_at(self.find(points, bone_transforms, pose), pose, precision)
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
-        """Go back to the canonical frame, in full float32; arguments as in `forward`."""
+    def node_weights(self) -> NodeWeights | None:
+        """Evaluate the skinning weights that `find` and `far_points` share; None in a system that shares none."""
+        return None
+
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
+        """Go back to the canonical frame, in full float32; arguments as in `forward`.
+
+        Args:
+            weights: from `node_weights`, if they have been evaluated already.
+        """
         raise NotImplementedError
 
     def shape_at(self, found: Found, pose: Tensor, precision: str = "highest") -> FieldSamples:
@@ -213,8 +221,14 @@ class System(nn.Module):
         """Return the losses that only this system has, weighted, by name."""
         return {}
 
-    def far_points(self, count: int, bone_transforms: Tensor, generator: torch.Generator) -> Tensor | None:
-        """Return posed points [B, count, 3] where the field may be occupied, also away from samples; None if not known."""
+    def far_points(
+        self, count: int, bone_transforms: Tensor, generator: torch.Generator, weights: NodeWeights | None = None
+    ) -> Tensor | None:
+        """Return posed points [B, count, 3] where the field may be occupied, also away from samples; None if not known.
+
+        Args:
+            weights: from `node_weights`, if they have been evaluated already.
+        """
         return None
 
     def refresh_cells(self, pose: Tensor, precision: str = "highest") -> None:

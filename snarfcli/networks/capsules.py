@@ -49,8 +49,11 @@ def _(points, segments):
 def _remember(ctx, inputs, output):
     ctx.save_for_backward(output[1])
     ctx.mark_non_differentiable(output[1])
+    ctx.set_materialize_grads(False)
 
 
-nearest_segment.register_autograd(
-    lambda ctx, gradient, _: (gradient[:, None] * ctx.saved_tensors[0], None), setup_context=_remember
-)
+def _gradient(ctx, gradient, _):
+    return None if gradient is None else gradient[:, None] * ctx.saved_tensors[0], None
+
+
+nearest_segment.register_autograd(_gradient, setup_context=_remember)

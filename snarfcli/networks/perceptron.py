@@ -186,9 +186,13 @@ def _perceptron_context(ctx, inputs, output):
     ctx.has_extras = extras is not None
     ctx.save_for_backward(output[1], first, *([extras] if ctx.has_extras else []), *weights, *biases)
     ctx.mark_non_differentiable(output[1])
+    ctx.set_materialize_grads(False)  # no zeros for the activations, which are many
 
 
 def _perceptron_gradient(ctx, gradient, _):
+    if gradient is None:
+        nothing = [None] * ctx.count
+        return None, None, nothing, nothing, None, None, None, None
     saved, first, *rest = ctx.saved_tensors
     extras = rest.pop(0) if ctx.has_extras else None
     weights, biases = rest[: ctx.count], rest[ctx.count :]

@@ -2,65 +2,79 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from snarfcli.native.backend import choose_backend
+from snarfcli.native.cpu_optimizer import adam_step
 from snarfcli.training.settings import TrainingConfig
 
-__all__ = ["AveragedAdam"]
+__all__ = ["AveragedAdam", "adam_step_reference"]
+
+_DECAYS = (0.9, 0.999)
+_EPSILON = 1e-8
 
 
 class AveragedAdam:
     """Adam with a faster learning rate for feature grids, and an exponential moving average of the parameters.
 
+    Features that no point of a step has touched keep their values and moments in it.
+
     Args:
         model: the system whose parameters are trained.
         config: learning rates and decay of the average.
+
+    Source: Kingma and Ba, Adam, ICLR 2015, Algorithm 1; untouched features after Mueller et al., SIGGRAPH 2022, Sec. 4.
     """
 
     def __init__(self, model: nn.Module, config: TrainingConfig) -> None:
         self._model, self._config = model, config
-        self._start()
-
-    def _start(self) -> None:
-        """Start Adam and the average with the parameters that the model has now."""
-        model, config = self._model, self._config
         self.parameters = self._trained()
         self.average = [parameter.detach().clone() for parameter in self.parameters]
-        tables = {id(p) for name, p in model.named_parameters() if name.endswith("grids.table")}
-        groups = [
-            [parameter for parameter in self.parameters if id(parameter) not in tables],
-            [parameter for parameter in self.parameters if id(parameter) in tables],
-        ]
-        self._adam = torch.optim.Adam([{"params": group} for group in groups if group], lr=config.learning_rate, fused=True)
+        self._first = [torch.zeros_like(value) for value in self.average]
+        self._second = [torch.zeros_like(value) for value in self.average]
+        self._are_features = [name.endswith("grids.table") for name, p in model.named_parameters() if p.requires_grad]
 
     def _trained(self) -> list[nn.Parameter]:
         return [parameter for parameter in self._model.parameters() if parameter.requires_grad]
 
     def zero_gradients(self) -> None:
         """Forget the gradients of the last step."""
-        self._adam.zero_grad(set_to_none=True)
+        for parameter in self.parameters:
+            parameter.grad = None
 
-    def gradient_norm(self) -> Tensor:
-        """Return the sum of the norms of all gradients."""
-        gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
-        norms = torch._foreach_norm(gradients)  # pyright: ignore[reportPrivateImportUsage]  # no public name
-        return torch.stack(norms).sum()
-
-    def step(self, learning_rate: float, step: int) -> None:
+    @torch.no_grad()
+    def step(self, learning_rate: float, step: int) -> float:
         """Update the parameters, and then their average; `step` counts from 0.
 
         The average follows quickly at first, since the first parameters are far from the final ones.
+
+        Returns:
+            The sum of the magnitudes of all gradients. If it is not finite, nothing has changed.
         """
-        for group, factor in zip(self._adam.param_groups, (1.0, self._config.feature_rate), strict=False):
-            group["lr"] = learning_rate * factor
-        self._adam.step()
-        decay = min(self._config.average_decay, (2 + step) / (11 + step))
-        with torch.no_grad():
-            current = [parameter.detach() for parameter in self.parameters]
-            torch._foreach_lerp_(self.average, current, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]  # no public name
+        used = [index for index, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        gradients = [self.parameters[index].grad for index in used]
+        values = [self.parameters[index].detach() for index in used]
+        rates = [learning_rate * (self._config.feature_rate if self._are_features[index] else 1.0) for index in used]
+        is_native = all(value.device.type == "cpu" and value.dtype == torch.float32 for value in values)
+        run = adam_step if is_native and choose_backend("auto") == "native" else adam_step_reference
+        return run(
+            values,
+            [gradient.contiguous() for gradient in gradients if gradient is not None],
+            [self._first[index] for index in used],
+            [self._second[index] for index in used],
+            [self.average[index] for index in used],
+            rates,
+            [self._are_features[index] for index in used],
+            step + 1,
+            _DECAYS,
+            _EPSILON,
+            min(self._config.average_decay, (2 + step) / (11 + step)),
+        )
 
     @torch.no_grad()
     def follow_growth(self) -> None:
@@ -69,21 +83,19 @@ class AveragedAdam:
         for index, (old, new) in enumerate(zip(self.parameters, grown, strict=True)):
             if new is old:
                 continue
-            more = len(new) - len(old)
-            self.average[index] = torch.cat([self.average[index], new.detach()[len(old) :]])
-            moments = self._adam.state.pop(old, {})
-            for name in ("exp_avg", "exp_avg_sq"):
-                if name in moments:
-                    moments[name] = torch.cat([moments[name], new.new_zeros(more, *new.shape[1:])])
-            if moments:
-                self._adam.state[new] = moments
-            for group in self._adam.param_groups:
-                group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+            added = new.detach()[len(old) :]
+            self.average[index] = torch.cat([self.average[index], added])
+            for moments in (self._first, self._second):
+                moments[index] = torch.cat([moments[index], torch.zeros_like(added)])
         self.parameters = grown
 
     def state(self) -> dict[str, Any]:
         """Return what the coming steps depend on, besides the parameters."""
-        return {"average": [value.cpu().clone() for value in self.average], "optimizer": self._adam.state_dict()}
+        moments = {"first": self._first, "second": self._second}
+        return {
+            "average": [value.cpu().clone() for value in self.average],
+            "optimizer": {name: [value.cpu().clone() for value in values] for name, values in moments.items()},
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from `state`, for a model that has its parameters already.
@@ -91,7 +103,67 @@ class AveragedAdam:
         Raises:
             KeyError, RuntimeError, TypeError, ValueError: the state does not fit the model.
         """
-        self._start()
-        self._adam.load_state_dict(state["optimizer"])
-        for mine, saved in zip(self.average, state["average"], strict=True):
-            mine.copy_(saved)
+        self.parameters = self._trained()
+        moments = state["optimizer"]
+        given = (state["average"], moments["first"], moments["second"])
+        self.average, self._first, self._second = ([self._like(*p) for p in self._paired(values)] for values in given)
+
+    def _paired(self, values: list[Tensor]) -> zip[tuple[Tensor, Tensor]]:
+        return zip(values, self.parameters, strict=True)
+
+    @staticmethod
+    def _like(value: Tensor, parameter: Tensor) -> Tensor:
+        if value.shape != parameter.shape:
+            raise ValueError(f"wanted {list(parameter.shape)} numbers of the optimiser, got {list(value.shape)}")
+        return value.to(parameter.detach()).clone()
+
+
+def adam_step_reference(
+    values: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    first: Sequence[Tensor],
+    second: Sequence[Tensor],
+    averages: Sequence[Tensor],
+    rates: Sequence[float],
+    skips_untouched: Sequence[bool],
+    step: int,
+    decays: tuple[float, float],
+    epsilon: float,
+    average_decay: float,
+) -> float:
+    """Take one step of Adam and of the average of the parameters in place: the readable version, for every device.
+
+    Args:
+        values: the parameters.
+        gradients: of the loss by them, of the same shapes, as are the following.
+        first, second: moments of the gradients.
+        averages: of the parameters.
+        rates: learning rate of each.
+        skips_untouched: whether rows whose gradient is all zero keep their values and moments.
+        step: 1 for the first.
+        decays: of the two moments.
+        epsilon: added to the root of the second moment.
+        average_decay: of the averages.
+
+    Returns:
+        The sum of the magnitudes of all gradients. If it is not finite, nothing has changed.
+    """
+    magnitude = float(sum(gradient.abs().sum(dtype=torch.float64) for gradient in gradients))
+    if not math.isfinite(magnitude):
+        return magnitude
+    corrections = [1 - decay**step for decay in decays]
+    for value, gradient, mean, square, average, rate, skips in zip(
+        values, gradients, first, second, averages, rates, skips_untouched, strict=True
+    ):
+        new_mean = mean.lerp(gradient, 1 - decays[0])
+        new_square = square.lerp(gradient * gradient, 1 - decays[1])
+        change = rate / corrections[0] * new_mean / ((new_square / corrections[1]).sqrt() + epsilon)
+        if skips:
+            touched = gradient.flatten(1).ne(0).any(1).reshape(-1, *[1] * (gradient.ndim - 1))
+            new_mean, new_square = torch.where(touched, new_mean, mean), torch.where(touched, new_square, square)
+            change = change * touched
+        mean.copy_(new_mean)
+        square.copy_(new_square)
+        value.sub_(change)
+        average.lerp_(value, 1 - average_decay)
+    return magnitude

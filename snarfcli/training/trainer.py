@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from snarfcli.deformer import NodeWeights
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import iou
 from snarfcli.models.extent import bone_owners, bone_segments
@@ -83,21 +84,21 @@ class Trainer:
             self.model.refresh_cells(self.batches.poses(_POSES_OF_A_REFRESH, generator), self.config.precision)
             self.optimizer.follow_growth()
         batch = self.batches.batch(self.step)
+        weights = self.model.node_weights()
         if self.config.far_points:
-            batch = self._with_far_points(batch)
-        found = self.model.find(batch.points, batch.bone_transforms, batch.pose)
+            batch = self._with_far_points(batch, weights)
+        found = self.model.find(batch.points, batch.bone_transforms, batch.pose, weights)
         field = self.model.shape_at(found, batch.pose, self.config.precision)
         losses = {"occupancy": occupancy_loss(field.logits, batch.occupied, field.found)}
         if self.step < self.config.bootstrap_steps:
             losses |= self._bootstrap_losses(batch, found)
         losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._generator(5), self.config.precision)
         total = reduce(torch.add, losses.values())
-        self._check_finite("loss", total)
+        self._check_finite("loss", total.item())
         self.optimizer.zero_gradients()
         with matmul_precision("medium" if self.config.precision == "bfloat16" else self.config.precision):
             total.backward()
-        self._check_finite("gradient", self.optimizer.gradient_norm())
-        self.optimizer.step(self.learning_rate(), self.step)
+        self._check_finite("gradient", self.optimizer.step(self.learning_rate(), self.step))
         self.step += 1
         lost = (batch.occupied & ~field.found).sum() / batch.occupied.sum().clamp_min(1)
         numbers = {name: loss.item() for name, loss in losses.items()}
@@ -105,11 +106,11 @@ class Trainer:
         numbers |= {"correspondences_per_point": field.correspondences / max(batch.occupied.numel(), 1)}
         return numbers
 
-    def _check_finite(self, what: str, value: Tensor) -> None:
-        """Raise Diverged before a step that would spoil the weights."""
-        if not bool(value.isfinite()):
+    def _check_finite(self, what: str, value: float) -> None:
+        """Raise Diverged for a step that would spoil the weights, and that is not taken."""
+        if not math.isfinite(value):
             raise Diverged(
-                f"diverged: the {what} is {value.item()} at step {self.step}; lower training.learning_rate, now "
+                f"diverged: the {what} is {value} at step {self.step}; lower training.learning_rate, now "
                 f"{self.config.learning_rate:g}, and start again with overwrite=true"
             )
 
@@ -119,13 +120,13 @@ class Trainer:
         return torch.Generator().manual_seed(seed)
 
     @torch.no_grad()
-    def _with_far_points(self, batch: Batch) -> Batch:
+    def _with_far_points(self, batch: Batch, weights: NodeWeights | None) -> Batch:
         """Append points outside the cubes of the frames of a batch, where nothing is occupied.
 
         There are no samples outside, so they would not show a part of the shape that every pose moves out of the cube, such as
         one beyond the nose of an animal. A point inside a cube, where its label is unknown, is moved beyond all cells.
         """
-        points = self.model.far_points(self.config.far_points, batch.bone_transforms, self._generator(4))
+        points = self.model.far_points(self.config.far_points, batch.bone_transforms, self._generator(4), weights)
         if points is None:
             return batch
         lower, upper = batch.cube[:, None, 0], batch.cube[:, None, 1]

@@ -19,7 +19,7 @@ def test_far_points_are_outside_the_cubes(tmp_path):
     tight = replace(batch, cube=torch.stack([batch.cube[:, 0] + 0.3 * half, batch.cube[:, 1] - 0.3 * half], 1))
     count = batch.points.shape[1]
     for given in (batch, tight):
-        more = trainer._with_far_points(given)
+        more = trainer._with_far_points(given, trainer.model.node_weights())
         assert torch.equal(more.points[:, :count], batch.points)
         assert torch.equal(more.occupied[:, :count], batch.occupied)
         far = more.points[:, count:]
@@ -33,7 +33,7 @@ def test_far_points_are_outside_the_cubes(tmp_path):
     assert 0.05 < reached.float().mean() < 0.95
     assert (far[~reached].norm(dim=1) > 5).all()
     assert (far[reached].norm(dim=1) < 3).all()
-    again = trainer._with_far_points(tight)
+    again = trainer._with_far_points(tight, trainer.model.node_weights())
     assert torch.equal(again.points, more.points)  # a resumed run draws the same
 
 

@@ -16,7 +16,7 @@
 extern "C" {
 #endif
 
-#define SNARF_ABI_VERSION 3
+#define SNARF_ABI_VERSION 4
 
 enum { SNARF_OK = 0, SNARF_BAD_ARGUMENT = 1, SNARF_OUT_OF_MEMORY = 2 };
 
@@ -77,7 +77,7 @@ typedef struct snarf_feature_level {
   float lower[3];      /* of the first node, metres */
   float size[3];       /* sides of a cell, metres */
   int32_t nodes[3];    /* W, H, D */
-  const int32_t* rows; /* row of each node's features in the table, [D, H, W]; -1: zeros */
+  const int32_t* rows; /* row of each node's features in the table, [D, H, W]; zeros where there is no such row, as -1 */
 } snarf_feature_level;
 
 /* A canonical occupancy network (SNARF Eq. 1) in one pose; the last layer has one output. */
@@ -121,6 +121,25 @@ typedef struct snarf_encoding {
   int64_t rows;       /* R */
   int32_t threads;    /* at most */
 } snarf_encoding;
+
+/* Parameters [rows, columns] with their gradient, Adam's moments and the moving average of the parameters. */
+typedef struct snarf_parameters {
+  float* values;
+  const float* gradient;
+  float* first; /* moments of the gradient */
+  float* second;
+  float* average;
+  int64_t rows, columns;
+  float rate;
+  int32_t skips_untouched; /* rows whose gradient is all zero keep their values and moments */
+} snarf_parameters;
+
+typedef struct snarf_adam {
+  int64_t step; /* 1 for the first */
+  float first_decay, second_decay, epsilon;
+  float average_decay;
+  int32_t threads; /* at most */
+} snarf_adam;
 
 typedef struct snarf_roots snarf_roots;
 
@@ -175,6 +194,10 @@ SNARF_API int snarf_encode_backward(const snarf_encoding*, const float* out, con
  * are the gradients. */
 SNARF_API int snarf_segment_distances(const float* points, int64_t count, const float* segments, int32_t segment_count,
                                       int32_t threads, float* distance, float* direction);
+
+/* One step of Adam (Kingma and Ba 2015, Algorithm 1) and of the average. `magnitude` becomes the sum of the magnitudes of all
+ * gradients; nothing else changes if it is not finite. Results do not depend on the number of threads. */
+SNARF_API int snarf_adam_step(const snarf_parameters*, int32_t count, const snarf_adam*, double* magnitude);
 
 #ifdef __cplusplus
 }

@@ -246,3 +246,8 @@ int snarf_adam_step(const snarf_parameters* arrays, int32_t count, const snarf_a
   if (!valid(arrays, count, settings) || !magnitude) return SNARF_BAD_ARGUMENT;
   return in_number_type(4, [&](auto) { *magnitude = adam_step(arrays, count, *settings); });
 }
+
+int snarf_total_variation(const snarf_variation* given, double* total, float* gradient) {
+  if (!valid(given) || !total || !gradient) return SNARF_BAD_ARGUMENT;
+  return in_number_type(4, [&](auto) { *total = total_variation(*given, gradient); });
+}

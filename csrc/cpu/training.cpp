@@ -9,6 +9,7 @@
 #include "layer.h"
 #include "optimizer.h"
 #include "training_task.h"
+#include "variation.h"
 
 namespace snarf {
 namespace SNARF_ISA {
@@ -316,7 +317,7 @@ void distances(const DistanceTask& task, int64_t first, int64_t last) {
 }  // namespace
 
 TrainingKernels training_kernels() {
-  return {forward, backward, encode, encode_points, encode_level, distances, adam, magnitude};
+  return {forward, backward, encode, encode_points, encode_level, distances, adam, variation, magnitude};
 }
 
 }  // namespace SNARF_ISA

@@ -307,4 +307,42 @@ inline double adam_step(const snarf_parameters* given, int32_t count, const snar
   return total;
 }
 
+inline bool valid(const snarf_variation* given) {
+  if (!given || given->count < 1 || given->threads < 1 || !given->weights) return false;
+  for (int axis = 0; axis < 3; ++axis)
+    if (given->nodes[axis] < 1 || !(given->size[axis] > 0)) return false;
+  return true;
+}
+
+// Returns the total and writes its gradient.
+inline double total_variation(const snarf_variation& given, float* gradient) {
+  VariationTask task;
+  task.weights = given.weights;
+  task.used = given.used;
+  task.count = given.count;
+  task.gradient = gradient;
+  for (int axis = 0; axis < 3; ++axis) task.nodes[axis] = given.nodes[axis];
+  const int64_t width = task.nodes[0], height = task.nodes[1], depth = task.nodes[2], layer = width * height;
+  int64_t pairs[3] = {0, 0, 0};
+  const auto is_used = [&](int64_t node) { return !task.used || task.used[node]; };
+  for (int64_t n = 0; n < layer * depth; ++n) {
+    if (!is_used(n)) continue;
+    pairs[0] += n % width + 1 < width && is_used(n + 1);
+    pairs[1] += n / width % height + 1 < height && is_used(n + width);
+    pairs[2] += n / layer + 1 < depth && is_used(n + layer);
+  }
+  for (int axis = 0; axis < 3; ++axis)
+    task.scale[axis] = float(1 / (given.size[axis] * double(std::max<int64_t>(1, pairs[axis]))));
+  std::vector<double> totals(size_t(depth), 0.0);
+  task.totals = totals.data();
+  const int threads = int(std::max<int64_t>(1, std::min<int64_t>({given.threads, depth, layer * depth / 1024})));
+  Queue layers(depth, 1);
+  const bool well = run_phases(threads, {[&](int) {
+                                 for (int64_t first, last; layers.take(first, last);)
+                                   training_kernels().variation(task, first, last);
+                               }});
+  if (!well) throw std::bad_alloc();
+  return std::accumulate(totals.begin(), totals.end(), 0.0);
+}
+
 }  // namespace snarf

@@ -82,6 +82,16 @@ struct AdamTask {
   float average_decay;
 };
 
+struct VariationTask {
+  const float* weights;  // [D, H, W, J]
+  const uint8_t* used;   // [D, H, W], or null for all
+  int64_t nodes[3];      // W, H, D
+  int64_t count;         // J
+  float scale[3];        // 1 / (side of a cell * number of pairs along the axis)
+  float* gradient;       // [D, H, W, J]
+  double* totals;        // [D]
+};
+
 struct TrainingKernels {
   // Tiles first to last.
   void (*forward)(const TrainingTask&, int64_t first, int64_t last, float* scratch);
@@ -97,6 +107,8 @@ struct TrainingKernels {
   void (*distances)(const DistanceTask&, int64_t first, int64_t last);
   // Rows first to last.
   void (*adam)(const AdamTask&, const ParameterArray&, int64_t first, int64_t last);
+  // Layers first to last.
+  void (*variation)(const VariationTask&, int64_t first, int64_t last);
   double (*magnitude)(const float* gradient, int64_t count);
 };
 

@@ -17,6 +17,7 @@ from snarfcli.deformer.hierarchy import make_softmax
 from snarfcli.deformer.search_config import SearchConfig, as_search_config
 from snarfcli.deformer.skinning import blend_transforms, interpolate, skin
 from snarfcli.deformer.skinning_config import FIELDS, SkinningConfig
+from snarfcli.deformer.variation import total_variation
 from snarfcli.deformer.weights import (
     BonePrior,
     GridWeights,
@@ -24,7 +25,6 @@ from snarfcli.deformer.weights import (
     NodeWeights,
     VoxelWeights,
     WeightField,
-    total_variation,
 )
 
 __all__ = ["ForwardDeformer"]
@@ -271,9 +271,14 @@ class ForwardDeformer(nn.Module):
         """Move canonical points [N, 3] into one pose [J, 4, 4]; the inverse of the search."""
         return skin(canonical, self.skinning_weights(canonical), bone_transforms)
 
-    def smoothness(self) -> Tensor:
-        """Return the total variation of the weights over the nodes of active cells (see `total_variation`)."""
-        return total_variation(self.weight_grid(active_only=True), self.grid, corners_of(self.active_cells))
+    def smoothness(self, weights: NodeWeights | None = None) -> Tensor:
+        """Return the total variation of the weights over the nodes of active cells (see `total_variation`).
+
+        Args:
+            weights: from `node_weights`, if they have been evaluated already.
+        """
+        values = self.weight_grid(active_only=True) if weights is None else weights.values
+        return total_variation(values, self.grid, corners_of(self.active_cells))
 
 
 def _make_field(

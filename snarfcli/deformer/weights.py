@@ -15,7 +15,7 @@ from snarfcli.deformer.skinning import interpolate
 from snarfcli.networks import ACTIVATIONS, run_perceptron
 from snarfcli.segments import segment_distances
 
-__all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWeights", "WeightField", "total_variation"]
+__all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWeights", "WeightField"]
 
 _SHARPNESS_OF_SOFTPLUS = 100.0  # as in the papers' code
 
@@ -217,29 +217,7 @@ class VoxelWeights(GridWeights):
 
     def at_nodes(self, nodes: Tensor | None = None) -> Tensor:
         """Return the weights [..., J] at the nodes with flat indices [...], or of all nodes, [D * H * W, J]."""
-        return self.softmax(self.sharpness * (self.logits if nodes is None else self.logits[nodes]))
-
-
-def total_variation(weights: Tensor, grid: CanonicalGrid, used: Tensor | None = None) -> Tensor:
-    """Return the change of weights from node to node, per metre: summed over bones and axes, averaged over neighbours.
-
-    The same field has the same value on a finer grid.
-
-    Args:
-        weights: [D, H, W, J], at the grid nodes.
-        grid: the box of the nodes.
-        used: [D, H, W], bool; only pairs of these nodes count. None for all.
-
-    Source: the regulariser that Fast-SNARF Sec. 4.2 mentions; the norm is our choice.
-    """
-    size = grid.cell_size(weights.shape[:3])
-    total = weights.new_zeros(())
-    for axis in range(3):  # z, y, x
-        count = weights.shape[axis] - 1
-        change = (weights.narrow(axis, 1, count) - weights.narrow(axis, 0, count)).abs().sum(-1) / size[2 - axis]
-        if used is None:
-            total = total + change.mean()
-        else:
-            pairs = used.narrow(axis, 1, count) & used.narrow(axis, 0, count)
-            total = total + (change * pairs).sum() / pairs.sum().clamp_min(1)
-    return total
+        if nodes is None:
+            return self.softmax(self.sharpness * self.logits)
+        chosen = self.logits.index_select(0, nodes.reshape(-1))  # whose gradient is faster than that of an index
+        return self.softmax(self.sharpness * chosen).reshape(*nodes.shape, -1)

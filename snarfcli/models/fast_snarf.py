@@ -200,10 +200,17 @@ class FastSnarf(System):
         return weights if weights.requires_grad else None  # given weights are not trained
 
     def extra_losses(
-        self, bone_transforms: Tensor, pose: Tensor, generator: torch.Generator, precision: str = "highest"
+        self,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        generator: torch.Generator,
+        precision: str = "highest",
+        found: FoundRoots | None = None,
     ) -> dict[str, Tensor]:
         smoothness = self.config.skinning.smoothness
-        return {"smoothness": smoothness * self.deformer.smoothness()} if smoothness > 0 else {}
+        if smoothness <= 0:
+            return {}
+        return {"smoothness": smoothness * self.deformer.smoothness(None if found is None else found.weights)}
 
     @torch.no_grad()
     def far_points(

@@ -137,7 +137,12 @@ class Nasa(PointwiseSystem):
         return self(move_with_bones(points, owner, bone_transforms), bone_transforms, pose, precision).logits
 
     def extra_losses(
-        self, bone_transforms: Tensor, pose: Tensor, generator: torch.Generator, precision: str = "highest"
+        self,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        generator: torch.Generator,
+        precision: str = "highest",
+        found: Found | None = None,
     ) -> dict[str, Tensor]:
         """Return the loss that puts each surface point on the border of one part and outside all others.
 

@@ -216,9 +216,22 @@ class System(nn.Module):
         return None
 
     def extra_losses(
-        self, bone_transforms: Tensor, pose: Tensor, generator: torch.Generator, precision: str = "highest"
+        self,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        generator: torch.Generator,
+        precision: str = "highest",
+        found: Found | None = None,
     ) -> dict[str, Tensor]:
-        """Return the losses that only this system has, weighted, by name."""
+        """Return the losses that only this system has, weighted, by name.
+
+        Args:
+            bone_transforms: [B, J, 4, 4].
+            pose: [B, J, 3].
+            generator: of random numbers.
+            precision: of the networks.
+            found: from `find` with the same parameters; what it has evaluated is then not evaluated again.
+        """
         return {}
 
     def far_points(

@@ -12,7 +12,7 @@ from torch import Tensor
 from snarfcli.native.capacity import fit_to_capacity
 from snarfcli.native.library import native_library
 
-__all__ = ["blend", "blend_backward", "broyden_search", "complete_search", "implicit_backward"]
+__all__ = ["blend", "blend_backward", "broyden_search", "complete_search", "implicit_backward", "total_variation"]
 
 
 class _Field(Structure):
@@ -59,6 +59,17 @@ class _Blending(Structure):
         ("count", c_int64),
         ("nodes", c_int32 * 3),
         ("bytes_per_number", c_int32),
+        ("threads", c_int32),
+    ]
+
+
+class _Variation(Structure):
+    _fields_ = [
+        ("weights", c_void_p),
+        ("used", c_void_p),
+        ("nodes", c_int32 * 3),
+        ("count", c_int32),
+        ("size", c_double * 3),
         ("threads", c_int32),
     ]
 
@@ -176,6 +187,18 @@ def implicit_backward(
     )
     _raise_for(code)
     return v_points, v_transforms
+
+
+def total_variation(weights: Tensor, size: Sequence[float], used: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the change of weights [D, H, W, J] from node to node, [], and its gradient; see `variation.total_variation`."""
+    weights, used = weights.contiguous(), None if used is None else used.contiguous()
+    depth, height, width, count = weights.shape
+    nodes = (c_int32 * 3)(width, height, depth)
+    place = None if used is None else used.data_ptr()
+    given = _Variation(weights.data_ptr(), place, nodes, count, (c_double * 3)(*size), torch.get_num_threads())
+    total, gradient = c_double(), torch.empty_like(weights)
+    _raise_for(_library().snarf_total_variation(byref(given), byref(total), c_void_p(gradient.data_ptr())))
+    return weights.new_tensor(total.value), gradient
 
 
 def _blending_inputs(weights: Tensor, bones: Tensor, active: Tensor | None) -> tuple[Tensor, Tensor, Tensor | None]:

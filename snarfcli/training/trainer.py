@@ -92,7 +92,7 @@ class Trainer:
         losses = {"occupancy": occupancy_loss(field.logits, batch.occupied, field.found)}
         if self.step < self.config.bootstrap_steps:
             losses |= self._bootstrap_losses(batch, found)
-        losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._generator(5), self.config.precision)
+        losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._generator(5), self.config.precision, found)
         total = reduce(torch.add, losses.values())
         self._check_finite("loss", total.item())
         self.optimizer.zero_gradients()

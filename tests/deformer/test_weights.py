@@ -9,7 +9,9 @@ from skinning_scenes import unit_grid
 from snarfcli.deformer import BonePrior, CanonicalGrid
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
 from snarfcli.deformer.skinning import interpolate
-from snarfcli.deformer.weights import NetworkWeights, VoxelWeights, total_variation
+from snarfcli.deformer.variation import total_variation, variation, variation_reference
+from snarfcli.deformer.weights import NetworkWeights, VoxelWeights
+from snarfcli.native import cpu
 
 PARENTS = [-1, 0, 1, 0]
 SHAPE = (4, 5, 6)
@@ -116,3 +118,34 @@ def test_another_box_moves_the_field(kind):
     before = field(share)
     field.set_box(large)
     torch.testing.assert_close(field(large.lower + share * 4), before, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(2, 2, 2, 1), (3, 5, 4, 7), (1, 4, 9, 24), (8, 32, 32, 24)])
+@pytest.mark.parametrize("share", [None, 0.0, 0.6, 1.0])
+def test_native_variation_equals_the_reference(shape, share):
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(shape, generator=generator)
+    used = None if share is None else torch.rand(shape[:3], generator=generator) < share
+    size = [0.1, 0.2, 0.05]
+    given = weights.double().requires_grad_()
+    if min(shape[:3]) == 1 and share is None:
+        return  # the mean over no neighbours is none
+    wanted = variation_reference(given, size, used)
+    results = []
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(cpu.total_variation(weights, size, used))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+    torch.testing.assert_close(results[0][0].double(), wanted.detach(), rtol=1e-5, atol=0)
+    torch.testing.assert_close(results[0][1].double(), torch.autograd.grad(wanted, given)[0], rtol=1e-5, atol=1e-9)
+
+
+def test_variation_is_an_operator():
+    weights = torch.rand(3, 4, 5, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
+    used = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(1)) < 0.7
+    assert torch.autograd.gradcheck(lambda given: variation(given, [0.1, 0.2, 0.3], used)[0], [weights])
+    torch.library.opcheck(variation, (weights.detach().float(), [0.1, 0.2, 0.3], used))

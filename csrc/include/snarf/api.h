@@ -141,6 +141,16 @@ typedef struct snarf_adam {
   int32_t threads; /* at most */
 } snarf_adam;
 
+/* Skinning weights at the nodes of a grid, whose changes are added up. */
+typedef struct snarf_variation {
+  const float* weights; /* [D, H, W, J] */
+  const uint8_t* used;  /* which nodes count, [D, H, W], or null for all */
+  int32_t nodes[3];     /* W, H, D */
+  int32_t count;        /* J */
+  double size[3];       /* sides of a cell, metres */
+  int32_t threads;      /* at most */
+} snarf_variation;
+
 typedef struct snarf_roots snarf_roots;
 
 SNARF_API int snarf_abi_version(void);
@@ -194,6 +204,10 @@ SNARF_API int snarf_encode_backward(const snarf_encoding*, const float* out, con
  * are the gradients. */
 SNARF_API int snarf_segment_distances(const float* points, int64_t count, const float* segments, int32_t segment_count,
                                       int32_t threads, float* distance, float* direction);
+
+/* Changes of the weights from node to node, per metre: summed over bones and axes, averaged over the pairs of neighbours along
+ * an axis that both count; and the gradient [D, H, W, J] of that. */
+SNARF_API int snarf_total_variation(const snarf_variation*, double* total, float* gradient);
 
 /* One step of Adam (Kingma and Ba 2015, Algorithm 1) and of the average. `magnitude` becomes the sum of the magnitudes of all
  * gradients; nothing else changes if it is not finite. Results do not depend on the number of threads. */

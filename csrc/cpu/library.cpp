@@ -251,3 +251,13 @@ int snarf_total_variation(const snarf_variation* given, double* total, float* gr
   if (!valid(given) || !total || !gradient) return SNARF_BAD_ARGUMENT;
   return in_number_type(4, [&](auto) { *total = total_variation(*given, gradient); });
 }
+
+int snarf_pose_codes(const snarf_codes* given, const float* codes, float* out) {
+  if (!valid(given) || (given->count && (!codes || !out))) return SNARF_BAD_ARGUMENT;
+  return in_number_type(4, [&](auto) { PoseCodes(*given).forward(codes, out); });
+}
+
+int snarf_pose_codes_backward(const snarf_codes* given, const float* v_out, float* v_codes) {
+  if (!valid(given) || !v_codes || (given->count && !v_out)) return SNARF_BAD_ARGUMENT;
+  return in_number_type(4, [&](auto) { PoseCodes(*given).backward(v_out, v_codes); });
+}

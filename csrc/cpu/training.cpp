@@ -8,6 +8,7 @@
 #include "features.h"
 #include "layer.h"
 #include "optimizer.h"
+#include "pose_code.h"
 #include "training_task.h"
 #include "variation.h"
 
@@ -317,7 +318,8 @@ void distances(const DistanceTask& task, int64_t first, int64_t last) {
 }  // namespace
 
 TrainingKernels training_kernels() {
-  return {forward, backward, encode, encode_points, encode_level, distances, adam, variation, magnitude};
+  return {forward, backward,  encode,     encode_points,       encode_level, distances,
+          adam,    variation, pose_codes, pose_codes_backward, magnitude};
 }
 
 }  // namespace SNARF_ISA

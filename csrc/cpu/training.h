@@ -345,4 +345,58 @@ inline double total_variation(const snarf_variation& given, float* gradient) {
   return std::accumulate(totals.begin(), totals.end(), 0.0);
 }
 
+inline bool valid(const snarf_codes* given) {
+  if (!given || given->count < 0 || given->poses < 0 || given->parts < 1 || given->size < 1 || given->threads < 1) return false;
+  if (given->count && !(given->seen && given->pose)) return false;
+  for (int64_t n = 0; n < given->count; ++n)
+    if (given->pose[n] < 0 || given->pose[n] >= given->poses) return false;
+  return true;
+}
+
+class PoseCodes {
+ public:
+  explicit PoseCodes(const snarf_codes& given) : count_(given.count), numbers_(given.poses * given.parts * given.size) {
+    task_.seen = given.seen;
+    task_.pose = given.pose;
+    task_.parts = given.parts;
+    task_.size = given.size;
+    threads_ = int(std::max<int64_t>(1, std::min<int64_t>(given.threads, given.count / kEncodedPerThread)));
+  }
+
+  void forward(const float* codes, float* out) {
+    task_.codes = codes;
+    task_.out = out;
+    Queue points(count_, 256);
+    run([&] {
+      for (int64_t first, last; points.take(first, last);) training_kernels().pose_codes(task_, first, last);
+    });
+  }
+
+  void backward(const float* v_out, float* v_codes) {
+    task_.v_out = v_out;
+    // Chunks do not depend on the number of threads, and so neither do the sums.
+    const int64_t chunks = std::max<int64_t>(1, std::min<int64_t>(16, count_ / kEncodedPerThread));
+    std::vector<float> parts(size_t(chunks * numbers_), 0.f);
+    Queue queue(chunks, 1);
+    run([&] {
+      for (int64_t chunk, end; queue.take(chunk, end);)
+        training_kernels().pose_codes_backward(task_, count_ * chunk / chunks, count_ * (chunk + 1) / chunks,
+                                               parts.data() + chunk * numbers_);
+    });
+    std::fill(v_codes, v_codes + numbers_, 0.f);
+    for (int64_t chunk = 0; chunk < chunks; ++chunk)
+      for (int64_t k = 0; k < numbers_; ++k) v_codes[k] += parts[size_t(chunk * numbers_ + k)];
+  }
+
+ private:
+  template <class Work>
+  void run(const Work& work) {
+    if (!run_phases(threads_, {[&](int) { work(); }})) throw std::bad_alloc();
+  }
+
+  int64_t count_, numbers_;
+  int threads_;
+  CodeTask task_;
+};
+
 }  // namespace snarf

@@ -92,6 +92,15 @@ struct VariationTask {
   double* totals;        // [D]
 };
 
+struct CodeTask {
+  const float* seen;    // [N, P]
+  const float* codes;   // [B, P, K]
+  const int64_t* pose;  // [N], 0 to B - 1
+  int64_t parts, size;  // P, K
+  float* out;           // [N, K]
+  const float* v_out;   // the same, on the way back
+};
+
 struct TrainingKernels {
   // Tiles first to last.
   void (*forward)(const TrainingTask&, int64_t first, int64_t last, float* scratch);
@@ -109,6 +118,9 @@ struct TrainingKernels {
   void (*adam)(const AdamTask&, const ParameterArray&, int64_t first, int64_t last);
   // Layers first to last.
   void (*variation)(const VariationTask&, int64_t first, int64_t last);
+  // Points first to last.
+  void (*pose_codes)(const CodeTask&, int64_t first, int64_t last);
+  void (*pose_codes_backward)(const CodeTask&, int64_t first, int64_t last, float* v_codes);
   double (*magnitude)(const float* gradient, int64_t count);
 };
 

@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid, NodeWeights, SearchConfig
@@ -23,7 +22,6 @@ NO_CORRESPONDENCE = -30.0
 """Logit of a point without a correspondence, which is certainly outside."""
 
 _POINTS_AT_ONCE = 32_768  # canonical points in one call of the shape network; smaller calls stay in the cache
-_ROUND_NUMBER = 512  # multiple of points in training: oneDNN compiles its matrix products again for every new size
 
 
 @dataclass
@@ -162,10 +160,7 @@ class System(nn.Module):
             return evaluate(self.shape, canonical, condition, pose, seen)
         with network_precision(precision, canonical.device):
             if torch.is_grad_enabled():
-                extra = -len(canonical) % _ROUND_NUMBER if canonical.device.type == "cpu" else 0
-                seen = None if seen is None else F.pad(seen, (0, 0, 0, extra))
-                padded = self.shape(F.pad(canonical, (0, 0, 0, extra)), condition, F.pad(pose, (0, extra)), seen)
-                return padded[: len(canonical)].to(canonical.dtype)
+                return self.shape(canonical, condition, pose, seen).to(canonical.dtype)
             parts = [values.split(_POINTS_AT_ONCE) for values in (canonical, pose)]
             parts.append([None] * len(parts[0]) if seen is None else seen.split(_POINTS_AT_ONCE))
             logits = [self.shape(points, condition, index, part) for points, index, part in zip(*parts, strict=True)]

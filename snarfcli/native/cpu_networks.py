@@ -11,7 +11,16 @@ from torch import Tensor
 
 from snarfcli.native.library import native_library
 
-__all__ = ["encode", "encode_backward", "feature_levels", "perceptron", "perceptron_backward", "segment_distances"]
+__all__ = [
+    "encode",
+    "encode_backward",
+    "feature_levels",
+    "perceptron",
+    "perceptron_backward",
+    "pose_codes",
+    "pose_codes_backward",
+    "segment_distances",
+]
 
 
 class _Layer(Structure):
@@ -51,6 +60,18 @@ class _Encoding(Structure):
         ("features", c_int32),
         ("table", c_void_p),
         ("rows", c_int64),
+        ("threads", c_int32),
+    ]
+
+
+class _Codes(Structure):
+    _fields_ = [
+        ("seen", c_void_p),
+        ("pose", c_void_p),
+        ("count", c_int64),
+        ("poses", c_int64),
+        ("parts", c_int32),
+        ("size", c_int32),
         ("threads", c_int32),
     ]
 
@@ -235,6 +256,32 @@ def encode_backward(
     )
     _check(code)
     return v_points, v_table
+
+
+def _codes(seen: Tensor, pose: Tensor, poses: int, size: int) -> _Codes:
+    count, parts = seen.shape
+    return _Codes(seen.data_ptr(), pose.data_ptr(), count, poses, parts, size, torch.get_num_threads())
+
+
+def pose_codes(seen: Tensor, codes: Tensor, pose: Tensor) -> Tensor:
+    """Return the pose codes [N, K] of points; see `networks.pose_code` for arguments."""
+    library = native_library()
+    assert library is not None
+    seen, codes, pose = seen.contiguous(), codes.contiguous(), pose.contiguous()
+    out = codes.new_empty(len(seen), codes.shape[2])
+    _check(library.snarf_pose_codes(byref(_codes(seen, pose, len(codes), codes.shape[2])), _pointer(codes), _pointer(out)))
+    return out
+
+
+def pose_codes_backward(gradient: Tensor, seen: Tensor, pose: Tensor, poses: int) -> Tensor:
+    """Return the gradient by the codes [B, P, K], from that by the points' codes [N, K]."""
+    library = native_library()
+    assert library is not None
+    seen, gradient, pose = seen.contiguous(), gradient.contiguous(), pose.contiguous()
+    size = gradient.shape[1]
+    v_codes = gradient.new_empty(poses, seen.shape[1], size)
+    _check(library.snarf_pose_codes_backward(byref(_codes(seen, pose, poses, size)), _pointer(gradient), _pointer(v_codes)))
+    return v_codes
 
 
 def segment_distances(points: Tensor, segments: Tensor) -> tuple[Tensor, Tensor]:

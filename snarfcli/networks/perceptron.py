@@ -20,6 +20,7 @@ __all__ = ["ACTIVATIONS", "perceptron", "perceptron_reference", "run_perceptron"
 ACTIVATIONS = {"relu": 1, "softplus": 2}
 """Numbers of the activations in the native library."""
 
+_ROUND_NUMBER = 512  # multiple of rows in training: oneDNN compiles its matrix products again for every new size
 _WIDE = 96  # layers of 64 are faster natively also where PyTorch multiplies in bfloat16 (benchmarks/bm_training.py)
 
 
@@ -71,7 +72,12 @@ def run_perceptron(
     is_float32_on_cpu = first.device.type == "cpu" and first.dtype == weights[0].dtype == torch.float32
     if is_float32_on_cpu and not _is_faster_in_pytorch(weights) and choose_backend("auto") == "native":
         return perceptron(first, extras, list(weights), list(biases), *settings)[0]
-    return perceptron_reference(first, extras, weights, biases, *settings)
+    extra = -len(first) % _ROUND_NUMBER if is_float32_on_cpu and torch.is_grad_enabled() else 0
+    if not extra:
+        return perceptron_reference(first, extras, weights, biases, *settings)
+    padded = [None if given is None else F.pad(given, (0, 0, 0, extra)) for given in (first, extras)]
+    assert padded[0] is not None
+    return perceptron_reference(padded[0], padded[1], weights, biases, *settings)[: len(first)]
 
 
 def _is_faster_in_pytorch(weights: Sequence[Tensor]) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from snarfcli.networks import ACTIVATIONS, run_encoding, run_perceptron, run_segment_distance
+from snarfcli.networks import ACTIVATIONS, run_encoding, run_perceptron, run_pose_code, run_segment_distance
 from snarfcli.shape.features import FeatureGrids
 
 __all__ = ["LOGITS_PER_METRE", "SOFTPLUS_SHARPNESS", "OccupancyNetwork", "ShapeConfig"]
@@ -170,9 +170,7 @@ class OccupancyNetwork(nn.Module):
 
 def _local_code(pose_code: nn.Linear, condition: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
     """Return the pose code [M, K] of each point, from the parts of the condition that it sees."""
-    parts = seen.shape[1]
-    mapping = pose_code.weight.unflatten(1, (parts, -1))  # [K, P, C / P]
-    codes = torch.einsum("bpc,kpc->pbk", condition.unflatten(1, (parts, -1)), mapping)
-    every = (seen @ codes.flatten(1)).unflatten(1, (len(condition), -1))  # for all poses, which is a small product
-    chosen = pose[:, None, None].expand(-1, 1, every.shape[2])
-    return every.gather(1, chosen)[:, 0] + pose_code.bias
+    parts = condition.unflatten(1, (seen.shape[1], -1))  # [B, P, C / P]
+    mapping = pose_code.weight.unflatten(1, (seen.shape[1], -1))  # [K, P, C / P]
+    codes = (parts[:, :, None] * mapping.transpose(0, 1)).sum(-1)  # small: faster than a product of matrices
+    return run_pose_code(seen, codes, pose) + pose_code.bias

@@ -141,6 +141,15 @@ typedef struct snarf_adam {
   int32_t threads; /* at most */
 } snarf_adam;
 
+/* Points that see the P parts of a pose's code by different shares. */
+typedef struct snarf_codes {
+  const float* seen;    /* [N, P] */
+  const int64_t* pose;  /* [N], 0 to B - 1 */
+  int64_t count, poses; /* N, B */
+  int32_t parts, size;  /* P, K */
+  int32_t threads;      /* at most */
+} snarf_codes;
+
 /* Skinning weights at the nodes of a grid, whose changes are added up. */
 typedef struct snarf_variation {
   const float* weights; /* [D, H, W, J] */
@@ -204,6 +213,11 @@ SNARF_API int snarf_encode_backward(const snarf_encoding*, const float* out, con
  * are the gradients. */
 SNARF_API int snarf_segment_distances(const float* points, int64_t count, const float* segments, int32_t segment_count,
                                       int32_t threads, float* distance, float* direction);
+
+/* out [N, K]: the sum over p of seen[n, p] codes[pose[n], p], for codes [B, P, K]. */
+SNARF_API int snarf_pose_codes(const snarf_codes*, const float* codes, float* out);
+/* The gradient by the codes from that by `out`; it does not depend on the number of threads. */
+SNARF_API int snarf_pose_codes_backward(const snarf_codes*, const float* v_out, float* v_codes);
 
 /* Changes of the weights from node to node, per metre: summed over bones and axes, averaged over the pairs of neighbours along
  * an axis that both count; and the gradient [D, H, W, J] of that. */

@@ -3,9 +3,7 @@
 
 #include <string.h>
 
-#include <type_traits>
-
-#include "lanes.h"
+#include "blocks.h"
 #include "network_task.h"
 
 namespace snarf {
@@ -68,15 +66,6 @@ SNARF_HD void corner_weights(const Place& place, float* weights) {
     weights[2 * k] = x[0] * yz;
     weights[2 * k + 1] = x[1] * yz;
   }
-}
-
-// Calls block(first, F) for blocks of F = 8, 4 and 1 features that make up `count`. Their numbers stay in registers.
-template <class Block>
-SNARF_HD void for_blocks(int count, const Block& block) {
-  int first = 0;
-  for (; first + 8 <= count; first += 8) block(first, std::integral_constant<int, 8>());
-  for (; first + 4 <= count; first += 4) block(first, std::integral_constant<int, 4>());
-  for (; first < count; ++first) block(first, std::integral_constant<int, 1>());
 }
 
 // out[count]: the features at a point, zeros outside of the level.

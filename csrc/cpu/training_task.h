@@ -96,7 +96,7 @@ struct CodeTask {
   const float* seen;    // [N, P]
   const float* codes;   // [B, P, K]
   const int64_t* pose;  // [N], 0 to B - 1
-  int64_t parts, size;  // P, K
+  int32_t parts, size;  // P, K
   float* out;           // [N, K]
   const float* v_out;   // the same, on the way back
 };

@@ -195,7 +195,7 @@ def _check(config: TrainConfig) -> None:
             f"search: wanted snarf or broyden with model=snarf, got {config.search.name}; give one of them, or leave search out"
         )
     check_skinning(config.skinning, config.search)
-    if config.model.name != "fast_snarf" and config.skinning.name in ("voxel", "preset"):
+    if config.model.name != "fast_snarf" and config.skinning.name == "preset":
         raise UserError(
             f"skinning={config.skinning.name} is for model=fast_snarf, got model={config.model.name}; leave skinning out"
         )

@@ -18,8 +18,8 @@ class PoseONet(PointwiseSystem):
     """The pose is concatenated to the posed point at the input of one network, which does not use bones.
 
     Points are moved back with the root bone, so that the network need not learn the position of the body. The network is that
-    of the canonical shape, except that the pose enters at the input and that there are no capsules, which would have to move
-    with the pose. It takes the whole pose for every `condition`.
+    of the canonical shape, except that the pose enters at the input and that there are neither capsules nor feature grids,
+    which would have to move with the pose. It takes the whole pose for every `condition`.
 
     Arguments: as `PointwiseSystem`.
     """
@@ -27,12 +27,9 @@ class PoseONet(PointwiseSystem):
     has_canonical_shape: ClassVar[bool] = False
 
     def _make_shape(self, bones: Tensor, box: tuple[Tensor, Tensor]) -> OccupancyNetwork:
-        if self.config.shape.feature_cells_m:
-            raise ValueError("model pose_onet has no canonical shape for feature grids; give shape=mlp")
         pose_size = 3 * (self.num_bones - 1)
-        shape = replace(
-            self.config.shape, condition_layer=0, condition_size=pose_size, condition_at_start=True, prior_radius_m=None
-        )
+        at_input = {"condition_layer": 0, "condition_size": pose_size, "condition_at_start": True}
+        shape = replace(self.config.shape, **at_input, prior_radius_m=None, feature_cells_m=[])
         return OccupancyNetwork(shape, pose_size, bones)
 
     def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, None]:

@@ -113,10 +113,11 @@ def test_systems_that_need_true_weights_reject_samples_without(config_for, name,
     assert not Path(config.output_root).exists()
 
 
-def test_fields_of_the_grid_are_for_fast_snarf(config_for):
+def test_preset_weights_are_for_fast_snarf(config_for):
     config = config_for("back_lbs")
-    with pytest.raises(UserError, match="skinning=voxel is for model=fast_snarf, got model=back_lbs; leave skinning out"):
-        run(replace(config, skinning=replace(config.skinning, name="voxel")))
+    skinning = replace(config.skinning, name="preset", weights_file="weights.npz")
+    with pytest.raises(UserError, match="skinning=preset is for model=fast_snarf, got model=back_lbs; leave skinning out"):
+        run(replace(config, skinning=skinning))
     assert not Path(config.output_root).exists()
 
 

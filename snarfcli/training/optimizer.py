@@ -22,7 +22,8 @@ _EPSILON = 1e-8
 class AveragedAdam:
     """Adam with a faster learning rate for feature grids, and an exponential moving average of the parameters.
 
-    Features that no point of a step has touched keep their values and moments in it.
+    Values at the nodes of a grid (features, logits of skinning weights) that no point of a step has touched keep their values
+    and moments in it.
 
     Args:
         model: the system whose parameters are trained.
@@ -37,7 +38,9 @@ class AveragedAdam:
         self.average = [parameter.detach().clone() for parameter in self.parameters]
         self._first = [torch.zeros_like(value) for value in self.average]
         self._second = [torch.zeros_like(value) for value in self.average]
-        self._are_features = [name.endswith("grids.table") for name, p in model.named_parameters() if p.requires_grad]
+        names = [name for name, parameter in model.named_parameters() if parameter.requires_grad]
+        self._are_features = [name.endswith("grids.table") for name in names]
+        self._are_nodes = [name.endswith(("grids.table", "field.logits")) for name in names]
 
     def _trained(self) -> list[nn.Parameter]:
         return [parameter for parameter in self._model.parameters() if parameter.requires_grad]
@@ -69,7 +72,7 @@ class AveragedAdam:
             [self._second[index] for index in used],
             [self.average[index] for index in used],
             rates,
-            [self._are_features[index] for index in used],
+            [self._are_nodes[index] for index in used],
             step + 1,
             _DECAYS,
             _EPSILON,

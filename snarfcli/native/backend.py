@@ -60,5 +60,5 @@ def _why_no_cuda_kernels() -> str | None:
 
 @cache
 def _warn_once(reason: str) -> None:
-    message = f"snarf searches with its reference in PyTorch, many times slower than its native kernels: {reason}"
+    message = f"snarf computes with its references in PyTorch, many times slower than with its native kernels: {reason}"
     warnings.warn(message, RuntimeWarning, stacklevel=3)

@@ -52,7 +52,7 @@ def timed(work: Callable[[], object], repeats: int) -> list[float]:
 def in_pytorch() -> Iterator[None]:
     """Evaluate networks layer by layer in PyTorch instead of natively."""
     with ExitStack() as stack:
-        for module in ("perceptron", "encoding", "capsules"):
+        for module in ("perceptron", "encoding", "capsules", "pose_code"):
             stack.enter_context(mock.patch(f"snarfcli.networks.{module}.choose_backend", return_value="reference"))
         yield
 

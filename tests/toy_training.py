@@ -44,7 +44,8 @@ def training_config(**changes: object) -> TrainingConfig:
         workers=0, learning_rate=1e-2,
         feature_rate=3.0, final_learning_rate=0.05,
         warmup_steps=5, average_decay=0.95, bootstrap_steps=50, bone_occupancy_weight=0.1,
-        bone_points=5, joint_weight=1.0, joint_target="halves", refresh_cells_every=40, precision="highest",
+        bone_points=5, joint_weight=1.0, joint_target="halves", refresh_cells_every=40,
+        extend_weights_every=60, precision="highest",
         validate_every=75, validation_frames=2, checkpoint_every=50,
     )  # fmt: skip
     return replace(config, **changes)

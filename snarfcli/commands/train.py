@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 _AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every")
 _NOT_NEGATIVE = (
     "uniform_points", "surface_points", "far_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight",
-    "joint_weight", "validation_frames", "refresh_cells_every", "workers",
+    "joint_weight", "validation_frames", "refresh_cells_every", "extend_weights_every", "workers",
 )  # fmt: skip
 _LEAST_OF_PARTS = {"part_width": 1, "part_depth": 1, "part_code": 0, "part_weight": 0, "part_points": 1}
 

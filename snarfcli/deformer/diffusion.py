@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.deformer.harmonic import harmonic
 from snarfcli.deformer.skinning import interpolate
 from snarfcli.deformer.weights import GridWeights
 
@@ -16,8 +17,6 @@ _NODES_AT_ONCE = 4096  # bounds the memory of the distances to all vertices
 _ROUNDS = 3  # mean error at the vertices of the built-in body, 64 x 64 x 16: none 3.0 %, 3 rounds 2.0 %, 100 rounds 1.7 %
 _SMALL = 10_000  # number of nodes of a grid on which the solver converges fast enough
 _SUM_TOLERANCE = 1e-3  # files often hold weights in single precision, cut to a few bones
-_SOLVED = 1e-4  # largest change of a weight by one more step; a tenth of it changes no weight by more than 0.5 %
-_MOST_STEPS = 2000
 
 
 class PresetWeights(GridWeights):
@@ -94,7 +93,7 @@ def _diffuse(points: Tensor, weights: Tensor, grid: CanonicalGrid, shape: tuple[
     values[fixed] = _corrected(near, corner, trilinear_weights(local.clamp(0, 1)), weights)
     is_fixed = torch.zeros(len(nodes), dtype=torch.bool, device=nodes.device)
     is_fixed[fixed] = True
-    values = _harmonic(values.reshape(*shape, -1), is_fixed.reshape(shape), grid.cell_size(shape)).clamp_min(0)
+    values = harmonic(values.reshape(*shape, -1), is_fixed.reshape(shape), grid.cell_size(shape)).clamp_min(0)
     return values / values.sum(-1, keepdim=True)
 
 
@@ -136,46 +135,6 @@ def _corrected(values: Tensor, corner: Tensor, phi: Tensor, weights: Tensor) -> 
         spread = (phi[..., None] * lacking[:, None]).reshape(-1, values.shape[1])
         values = (values + torch.zeros_like(values).index_add(0, corner.reshape(-1), spread) / mass).clamp_min(0)
         values = values / values.sum(1, keepdim=True)
-    return values
-
-
-def _harmonic(start: Tensor, fixed: Tensor, cell_size: Tensor) -> Tensor:
-    """Solve Laplace's equation on the grid for values [D, H, W, J] that are kept where `fixed` [D, H, W].
-
-    Conjugate gradients, all J right-hand sides at once, with the diagonal as preconditioner.
-    """
-    free = (~fixed)[..., None].to(start)
-    conductance = [1 / cell_size[2 - axis].square() for axis in range(3)]
-
-    def laplacian(values: Tensor) -> Tensor:
-        out = torch.zeros_like(values)
-        for axis in range(3):
-            count = values.shape[axis] - 1
-            flow = conductance[axis] * (values.narrow(axis, 1, count) - values.narrow(axis, 0, count))
-            out.narrow(axis, 0, count).sub_(flow)
-            out.narrow(axis, 1, count).add_(flow)
-        return out
-
-    diagonal = torch.zeros_like(free)
-    for axis in range(3):
-        count = free.shape[axis] - 1
-        diagonal.narrow(axis, 0, count).add_(conductance[axis])
-        diagonal.narrow(axis, 1, count).add_(conductance[axis])
-    values = start.clone()
-    residual = -laplacian(values) * free
-    scaled = residual / diagonal
-    direction = scaled.clone()
-    size = (residual * scaled).sum((0, 1, 2))
-    for _ in range(_MOST_STEPS):
-        if not bool((scaled.abs() > _SOLVED).any()):
-            break
-        moved = laplacian(direction) * free
-        length = size / (direction * moved).sum((0, 1, 2)).clamp_min(1e-30)
-        values = values + length * direction
-        residual = residual - length * moved
-        scaled = residual / diagonal
-        before, size = size, (residual * scaled).sum((0, 1, 2))
-        direction = scaled + (size / before.clamp_min(1e-30)) * direction
     return values
 
 

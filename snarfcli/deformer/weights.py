@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.deformer.harmonic import harmonic
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
 from snarfcli.deformer.skinning import interpolate
 from snarfcli.networks import ACTIVATIONS, run_perceptron
@@ -18,6 +19,8 @@ from snarfcli.segments import segment_distances
 __all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWeights", "WeightField"]
 
 _SHARPNESS_OF_SOFTPLUS = 100.0  # as in the papers' code
+_LEAST_WEIGHT = 1e-9  # has a logit
+_SOLVED = 1e-3  # as exact as training needs it
 
 
 class WeightField(nn.Module):
@@ -221,3 +224,18 @@ class VoxelWeights(GridWeights):
             return self.softmax(self.sharpness * self.logits)
         chosen = self.logits.index_select(0, nodes.reshape(-1))  # whose gradient is faster than that of an index
         return self.softmax(self.sharpness * chosen).reshape(*nodes.shape, -1)
+
+    @torch.no_grad()
+    def extend_from(self, nodes: Tensor) -> None:
+        """Make the weights of all but some nodes harmonic: each has the mean of its neighbours, which adds no extremes.
+
+        Elsewhere than around the surface no sample determines the weights, and what training left there can tear parts off the
+        body in unseen poses.
+
+        Args:
+            nodes: [D, H, W], bool, the nodes that keep their weights, at least one.
+        """
+        size = CanonicalGrid(self.lower, self.upper, checked=True).cell_size(self.shape)
+        weights = harmonic(self.at_nodes().reshape(*self.shape, -1), nodes, size, _SOLVED).clamp_min(_LEAST_WEIGHT)
+        logits = self.softmax.invert(weights.log().reshape(-1, weights.shape[-1])) / self.sharpness
+        self.logits.copy_(torch.where(nodes.reshape(-1, 1), self.logits, logits))

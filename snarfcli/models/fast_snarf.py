@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, NodeWeights, SearchConfig, cells_near
 from snarfcli.deformer.cells import corners_of
+from snarfcli.deformer.weights import VoxelWeights
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
@@ -127,12 +128,46 @@ class FastSnarf(System):
             reach_m: cells at most this far from an occupied sample, along each axis, are included, active or not.
             precision: of the shape network.
         """
+        near, finer = self._occupied_samples(pose, threshold, precision)
+        per_metre = near.new_tensor(finer[::-1]) / self.deformer.grid.cell_size(self.deformer.shape)
+        for axis, count in enumerate((reach_m * per_metre - 1e-3).ceil().long().clamp_min(0).tolist()[::-1]):
+            along = [count if axis == other else 0 for other in range(3)]
+            near = F.max_pool3d(near, [2 * n + 1 for n in along], 1, along)
+        return F.max_pool3d(near, [factor + 1 for factor in finer], finer)[0, 0] > 0
+
+    def extend_weights(self, pose: Tensor, precision: str = "highest") -> None:
+        """Extend the skinning weights at nodes near the surface in the poses [P, J, 3] to all other nodes.
+
+        Nodes of the cells at the surface and of their neighbours keep their weights. Nothing changes for a weight field that is
+        not optimised at the nodes, or while nothing is occupied.
+        """
+        if not isinstance(self.deformer.field, VoxelWeights):
+            return
+        near = F.max_pool3d(self.surface_cells(pose, precision)[None, None].float(), 3, 1, 1)[0, 0] > 0
+        if bool(near.any()):
+            self.deformer.field.extend_from(corners_of(near))
+
+    @torch.no_grad()
+    def surface_cells(self, pose: Tensor, precision: str = "highest") -> Tensor:
+        """Return whether cells hold a part of the shape's surface, [D-1, H-1, W-1], bool.
+
+        The shape is all that is occupied in any of the poses [P, J, 3]; cells are sampled as in `occupied_cells`.
+        """
+        samples, finer = self._occupied_samples(pose, 0.0, precision)
+        window = [factor + 1 for factor in finer]
+        most, least = F.max_pool3d(samples, window, finer), -F.max_pool3d(-samples, window, finer)
+        return (most > least)[0, 0]
+
+    def _occupied_samples(self, pose: Tensor, threshold: float, precision: str) -> tuple[Tensor, list[int]]:
+        """Return whether samples of active cells are occupied in any pose, and into how many parts they divide a cell's sides.
+
+        Returns:
+            Zeros and ones [1, 1, ...] on a lattice that has the grid's nodes and samples between them; and three numbers, along
+            z, y and x.
+        """
         deformer = self.deformer
         weights = deformer.node_weights(active_only=True)
-        size = deformer.grid.cell_size(deformer.shape)
-        finer = (size / _SAMPLES_M).ceil().long()
-        reach = (reach_m * finer / size - 1e-3).ceil().long().clamp_min(0).tolist()[::-1]
-        finer = finer.tolist()[::-1]
+        finer = (deformer.grid.cell_size(deformer.shape) / _SAMPLES_M).ceil().long().tolist()[::-1]
         fine = deformer.active_cells
         for axis, factor in enumerate(finer):
             fine = fine.repeat_interleave(factor, axis)
@@ -145,11 +180,7 @@ class FastSnarf(System):
             values = self.canonical_logits(places[left], condition[None], torch.zeros_like(left), precision, seen)
             touched.view(-1)[left[values > threshold]] = True
             left = left[values <= threshold]
-        near = touched[None, None].float()
-        for axis, count in enumerate(reach):
-            along = [count if axis == other else 0 for other in range(3)]
-            near = F.max_pool3d(near, [2 * n + 1 for n in along], 1, along)
-        return F.max_pool3d(near, [factor + 1 for factor in finer], finer)[0, 0] > 0
+        return touched[None, None].float(), finer
 
     def refresh_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Recompute the active cells from the current shape; called periodically in training.

@@ -242,6 +242,9 @@ class System(nn.Module):
     def refresh_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Recompute the active cells from the current shape in poses [P, J, 3]; called periodically in training."""
 
+    def extend_weights(self, pose: Tensor, precision: str = "highest") -> None:
+        """Replace skinning weights that no sample determines in poses [P, J, 3]; called periodically in training."""
+
     def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Shrink the active cells to the final shape in poses [P, J, 3]."""
 

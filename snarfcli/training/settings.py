@@ -49,6 +49,9 @@ class TrainingConfig:
     """Target weights at a joint: halves (own bone and parent, SNARF), parent (Fast-SNARF) or own (the released code)."""
     refresh_cells_every: int = MISSING
     """Steps between two updates of the searched cells from the learned shape; 0 keeps the first cells."""
+    extend_weights_every: int = MISSING
+    """Steps after which skinning weights at nodes away from the surface, which no sample determines, are replaced by harmonic
+    ones, again and again; 0 never. Only for skinning=voxel."""
     precision: str = MISSING
     """Arithmetic of the shape network: highest, high, medium or bfloat16; the search is always in full float32."""
     validate_every: int = MISSING

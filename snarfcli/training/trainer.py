@@ -78,11 +78,7 @@ class Trainer:
         Raises:
             Diverged: the loss, or its gradient, is not finite; the step is not taken.
         """
-        every = self.config.refresh_cells_every
-        if every and self.step and self.step % every == 0:
-            generator = np.random.default_rng([self.seed, self.step, 2])
-            self.model.refresh_cells(self.batches.poses(_POSES_OF_A_REFRESH, generator), self.config.precision)
-            self.optimizer.follow_growth()
+        self._maintain_grids()
         batch = self.batches.batch(self.step)
         weights = self.model.node_weights()
         if self.config.far_points:
@@ -105,6 +101,17 @@ class Trainer:
         numbers |= {"total": total.item(), "inside_without_correspondence": lost.item()}
         numbers |= {"correspondences_per_point": field.correspondences / max(batch.occupied.numel(), 1)}
         return numbers
+
+    def _maintain_grids(self) -> None:
+        """Let the grids follow the shape, in the steps in which this is due."""
+        for every, update in (
+            (self.config.extend_weights_every, self.model.extend_weights),
+            (self.config.refresh_cells_every, self.model.refresh_cells),
+        ):
+            if every and self.step and self.step % every == 0:
+                generator = np.random.default_rng([self.seed, self.step, 2])
+                update(self.batches.poses(_POSES_OF_A_REFRESH, generator), self.config.precision)
+                self.optimizer.follow_growth()
 
     def _check_finite(self, what: str, value: float) -> None:
         """Raise Diverged for a step that would spoil the weights, and that is not taken."""

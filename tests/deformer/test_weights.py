@@ -149,3 +149,26 @@ def test_variation_is_an_operator():
     used = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(1)) < 0.7
     assert torch.autograd.gradcheck(lambda given: variation(given, [0.1, 0.2, 0.3], used)[0], [weights])
     torch.library.opcheck(variation, (weights.detach().float(), [0.1, 0.2, 0.3], used))
+
+
+@pytest.mark.parametrize("softmax", [PlainSoftmax(4), HierarchicalSoftmax(PARENTS)])
+def test_extended_weights_are_means_of_their_neighbours(softmax):
+    field = VoxelWeights(softmax, unit_grid(), (5, 6, 7), sharpness=5.0)
+    with torch.no_grad():
+        field.logits.normal_(generator=torch.Generator().manual_seed(0))
+    before = field.at_nodes().reshape(5, 6, 7, 4)
+    kept = torch.zeros(5, 6, 7, dtype=torch.bool)
+    kept[2, 2:4, 3] = kept[0, 0, 0] = True
+    field.extend_from(kept)
+    after = field.at_nodes().detach().reshape(5, 6, 7, 4)
+    assert torch.equal(after[kept], before[kept])
+    torch.testing.assert_close(after.sum(-1), torch.ones_like(after[..., 0]))
+    conductance = [1 / size**2 for size in unit_grid().cell_size((5, 6, 7)).tolist()]  # x, y, z
+    inner, around, total = after[1:-1, 1:-1, 1:-1], 0.0, 0.0
+    for axis, flow in zip((2, 1, 0), conductance, strict=True):
+        for start in (0, 2):
+            shifted = [slice(start, after.shape[a] - 2 + start) if a == axis else slice(1, -1) for a in range(3)]
+            around, total = around + flow * after[tuple(shifted)], total + flow
+    free = ~kept[1:-1, 1:-1, 1:-1]
+    assert float((inner - around / total)[free].abs().max()) < 0.02
+    assert float((before - after).abs()[~kept].mean()) > 0.1

@@ -67,11 +67,19 @@ ENVIRONMENTS = {
 }
 
 
+def run(command: list[str], environment: dict[str, str]) -> str:
+    """Return what a command prints; it runs outside of any clone, whose package would be imported instead of its own."""
+    elsewhere = Path(command[0]).resolve().parent
+    found = subprocess.run(command, env=os.environ | environment, cwd=elsewhere, capture_output=True, text=True, check=False)
+    if found.returncode:
+        raise SystemExit(f"{' '.join(command[:4])} failed:\n{found.stderr[-2000:]}")
+    return found.stdout
+
+
 def time_steps(python: str, preset: str, root: str, counts: tuple[int, int], environment: dict[str, str]) -> dict:
     """Return the times of steps in the version that `python` has, and its peak memory in kilobytes."""
     command = [python, "-c", STEPS, preset, root, *map(str, counts)]
-    result = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
-    return json.loads(result.stdout.splitlines()[-1])
+    return json.loads(run(command, environment).splitlines()[-1])
 
 
 def train(python: str, root: str, seed: int, environment: dict[str, str], folder: str) -> list[str]:
@@ -79,11 +87,11 @@ def train(python: str, root: str, seed: int, environment: dict[str, str], folder
     common = ["subject=50002", f"data_root={root}", f"output_root={folder}", "run=before"]
     start = time.perf_counter()
     command = [python, "-m", "snarfcli", "train", "training=quick", f"seed={seed}", "overwrite=true", "threads=2", *common]
-    subprocess.run(command, env=os.environ | environment, capture_output=True, check=True)
+    run(command, environment)
     row = [f"{time.perf_counter() - start:.0f} s"]
     for split in ("id", "ood"):
         command = [python, "-m", "snarfcli", "eval", f"split={split}", "figure=false", *common]
-        subprocess.run(command, env=os.environ | environment, capture_output=True, check=True)
+        run(command, environment)
         metrics = json.loads((Path(folder) / "builtin/50002/before" / f"eval_{split}/metrics.json").read_text())
         row.append(f"{100 * metrics['iou_bbox']:.1f} / {100 * metrics['iou_surface']:.1f}")
     return row
@@ -102,7 +110,7 @@ def main() -> None:
     require(Path(root) / "processed/builtin/50002/manifest.json", "snarf preprocess subject=50002")
     print_machine()
     environment = ENVIRONMENTS[options.instruction_set] | {"OMP_WAIT_POLICY": "PASSIVE"}
-    versions = {"before": options.before, "now": sys.executable}
+    versions = {"before": str(Path(options.before).absolute()), "now": sys.executable}
     rows = []
     for preset, counts in (("quick", (260, 80)), ("paper", (3, 6))):
         runs: dict[str, list[dict]] = {name: [] for name in versions}

@@ -11,10 +11,10 @@ namespace {
 
 // One row, or some parameters of an array that has no rows to skip.
 SNARF_HD void adam_rows(const AdamTask& task, const ParameterArray& array, int64_t first, int64_t count) {
-  float* __restrict__ const value = array.values + first;
-  float* __restrict__ const mean = array.first + first;
-  float* __restrict__ const square = array.second + first;
-  const float* __restrict__ const gradient = array.gradient + first;
+  float* __restrict const value = array.values + first;
+  float* __restrict const mean = array.first + first;
+  float* __restrict const square = array.second + first;
+  const float* __restrict const gradient = array.gradient + first;
   const float rate = array.rate * task.rate_correction;
   for (int64_t k = 0; k < count; ++k) {
     const float g = gradient[k];
@@ -36,8 +36,8 @@ void adam(const AdamTask& task, const ParameterArray& array, int64_t first, int6
   } else {
     adam_rows(task, array, begin, end - begin);
   }
-  float* __restrict__ const average = array.average;
-  const float* __restrict__ const value = array.values;
+  float* __restrict const average = array.average;
+  const float* __restrict const value = array.values;
   for (int64_t k = begin; k < end; ++k) average[k] += (1.f - task.average_decay) * (value[k] - average[k]);
 }
 

@@ -16,7 +16,7 @@
 #include <vector>
 
 #if !defined(_WIN32)
-#include <unistd.h>
+#include <pthread.h>
 #endif
 
 namespace snarf {
@@ -68,7 +68,8 @@ class Queue {
   std::atomic<int64_t> next_;
 };
 
-// Threads that sleep until they are given work; they live as long as the process.
+// Threads that sleep until they are given work. They live as long as the process, and so does this object, which is never
+// destroyed: at the end of the process they may still sleep in it. The library must not be unloaded once there are some.
 class Helpers {
  public:
   // The helpers of this process, if no other call has them; the caller must `release` them.
@@ -134,12 +135,14 @@ class Helpers {
       helper->give(nullptr);
     }
   }
+  // The number of forks that led to this process since the library was first used.
   static int64_t this_process() {
-#if defined(_WIN32)
-    return 0;  // no fork there
-#else
-    return int64_t(getpid());
+    static std::atomic<int64_t> forks{0};
+#if !defined(_WIN32)
+    static const int registered = pthread_atfork(nullptr, nullptr, [] { forks.fetch_add(1); });
+    (void)registered;
 #endif
+    return forks.load();
   }
 
   const int64_t process_ = this_process();

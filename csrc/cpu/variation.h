@@ -17,16 +17,16 @@ void variation(const VariationTask& task, int64_t first, int64_t last) {
   for (int64_t z = first; z < last; ++z) {
     double total = 0;
     for (int64_t n = z * step[2]; n < (z + 1) * step[2]; ++n) {
-      float* __restrict__ const gradient = task.gradient + n * count;
+      float* __restrict const gradient = task.gradient + n * count;
       memset(gradient, 0, sizeof(float) * size_t(count));
       if (task.used && !task.used[n]) continue;
-      const float* __restrict__ const here = task.weights + n * count;
+      const float* __restrict const here = task.weights + n * count;
       const int64_t place[3] = {n % nodes[0], n / step[1] % nodes[1], z};
       for (int axis = 0; axis < 3; ++axis)
         for (int side = -1; side <= 1; side += 2) {
           const int64_t other = n + side * step[axis], at = place[axis] + side;
           if (at < 0 || at >= nodes[axis] || (task.used && !task.used[other])) continue;
-          const float* __restrict__ const there = task.weights + other * count;
+          const float* __restrict const there = task.weights + other * count;
           const float scale = task.scale[axis];
           float sum = 0;
           for (int64_t j = 0; j < count; ++j) {

@@ -16,6 +16,7 @@ _NEIGHBOURS = 8  # vertices that determine the weights of a node near the surfac
 _NODES_AT_ONCE = 4096  # bounds the memory of the distances to all vertices
 _ROUNDS = 3  # mean error at the vertices of the built-in body, 64 x 64 x 16: none 3.0 %, 3 rounds 2.0 %, 100 rounds 1.7 %
 _SMALL = 10_000  # number of nodes of a grid on which the solver converges fast enough
+_SOLVED = 1e-4  # largest change of a weight by one more step of the solver
 _SUM_TOLERANCE = 1e-3  # files often hold weights in single precision, cut to a few bones
 
 
@@ -93,7 +94,7 @@ def _diffuse(points: Tensor, weights: Tensor, grid: CanonicalGrid, shape: tuple[
     values[fixed] = _corrected(near, corner, trilinear_weights(local.clamp(0, 1)), weights)
     is_fixed = torch.zeros(len(nodes), dtype=torch.bool, device=nodes.device)
     is_fixed[fixed] = True
-    values = harmonic(values.reshape(*shape, -1), is_fixed.reshape(shape), grid.cell_size(shape)).clamp_min(0)
+    values = harmonic(values.reshape(*shape, -1), is_fixed.reshape(shape), grid.cell_size(shape), _SOLVED).clamp_min(0)
     return values / values.sum(-1, keepdim=True)
 
 

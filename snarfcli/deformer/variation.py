@@ -26,18 +26,20 @@ def total_variation(weights: Tensor, grid: CanonicalGrid, used: Tensor | None = 
 
     Source: the regulariser that Fast-SNARF Sec. 4.2 mentions; the norm is our choice.
     """
-    size = grid.cell_size(weights.shape[:3]).tolist()
+    size = grid.cell_size(weights.shape[:3])
     is_native = weights.device.type == "cpu" and weights.dtype == torch.float32
     if is_native and choose_backend("auto") == "native":
-        return variation(weights, size, used)[0]
+        return variation(weights, size.tolist(), used)[0]
     return variation_reference(weights, size, used)
 
 
-def variation_reference(weights: Tensor, size: Sequence[float], used: Tensor | None) -> Tensor:
+def variation_reference(weights: Tensor, size: Sequence[float] | Tensor, used: Tensor | None) -> Tensor:
     """The readable version of `variation`, without its gradient."""
     total = weights.new_zeros(())
     for axis in range(3):  # z, y, x
         count = weights.shape[axis] - 1
+        if not count:
+            continue
         change = (weights.narrow(axis, 1, count) - weights.narrow(axis, 0, count)).abs().sum(-1) / size[2 - axis]
         if used is None:
             total = total + change.mean()

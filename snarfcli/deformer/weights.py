@@ -19,8 +19,8 @@ from snarfcli.segments import segment_distances
 __all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWeights", "WeightField"]
 
 _SHARPNESS_OF_SOFTPLUS = 100.0  # as in the papers' code
-_LEAST_WEIGHT = 1e-9  # has a logit
-_SOLVED = 1e-3  # as exact as training needs it
+_LEAST_WEIGHT = 1e-9  # so that every weight has a finite logit; the sum stays 1 in float32
+_SOLVED = 1e-3  # steps of Adam change weights by more
 
 
 class WeightField(nn.Module):

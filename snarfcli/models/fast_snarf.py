@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
@@ -69,7 +69,7 @@ class FastSnarf(System):
         field: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if config.model.name == "snarf":
-            config = replace(config, skinning=replace(config.skinning, name="mlp"))
+            config = replace(config, skinning=replace(config.skinning, name="mlp", smoothness=0.0))
         super().__init__(config, skeleton)
         if config.model.blend not in ("logit", "probability"):
             raise ValueError(f"model.blend: wanted logit or probability, got {config.model.blend!r}")
@@ -135,17 +135,21 @@ class FastSnarf(System):
             near = F.max_pool3d(near, [2 * n + 1 for n in along], 1, along)
         return F.max_pool3d(near, [factor + 1 for factor in finer], finer)[0, 0] > 0
 
-    def extend_weights(self, pose: Tensor, precision: str = "highest") -> None:
+    def extend_weights(self, pose: Tensor, precision: str = "highest") -> tuple[nn.Parameter, Tensor] | None:
         """Extend the skinning weights at nodes near the surface in the poses [P, J, 3] to all other nodes.
 
         Nodes of the cells at the surface and of their neighbours keep their weights. Nothing changes for a weight field that is
         not optimised at the nodes, or while nothing is occupied.
         """
-        if not isinstance(self.deformer.field, VoxelWeights):
-            return
+        field = self.deformer.field
+        if not isinstance(field, VoxelWeights):
+            return None
         near = F.max_pool3d(self.surface_cells(pose, precision)[None, None].float(), 3, 1, 1)[0, 0] > 0
-        if bool(near.any()):
-            self.deformer.field.extend_from(corners_of(near))
+        if not bool(near.any()):
+            return None
+        kept = corners_of(near)
+        field.extend_from(kept)
+        return field.logits, ~kept.reshape(-1)
 
     @torch.no_grad()
     def surface_cells(self, pose: Tensor, precision: str = "highest") -> Tensor:
@@ -197,10 +201,10 @@ class FastSnarf(System):
             self._cover_features()
 
     def _cover_features(self) -> None:
-        """Give features to the nodes of feature grids in active cells."""
+        """Give features to the nodes of feature grids in active cells; to all if the search has no cells."""
         grids = self.shape.grids if isinstance(self.shape, OccupancyNetwork) else None
         if grids is not None:
-            grids.cover(self.deformer.active_cells)
+            grids.cover(self.deformer.active_cells if self.search.name == "complete" else None)
 
     def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Keep only the active cells within 4 cm of what the final shape might occupy in any of the poses [P, J, 3].
@@ -249,7 +253,7 @@ class FastSnarf(System):
     ) -> Tensor:
         """Return random points of the searched cells, moved by the poses."""
         canonical = self.deformer.random_canonical(count, generator)
-        # without weights not interpolated on the grid, which would evaluate all its nodes
+        # without `weights`, the field itself at the points: to interpolate it, it would be evaluated at every node
         chosen = self.deformer.field(canonical) if weights is None else weights.at(canonical)
         blended = torch.einsum("nj,bjrc->bnrc", chosen, bone_transforms[:, :, :3])
         return (blended[..., :3] * canonical[:, None]).sum(-1) + blended[..., 3]

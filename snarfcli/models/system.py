@@ -242,8 +242,13 @@ class System(nn.Module):
     def refresh_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Recompute the active cells from the current shape in poses [P, J, 3]; called periodically in training."""
 
-    def extend_weights(self, pose: Tensor, precision: str = "highest") -> None:
-        """Replace skinning weights that no sample determines in poses [P, J, 3]; called periodically in training."""
+    def extend_weights(self, pose: Tensor, precision: str = "highest") -> tuple[nn.Parameter, Tensor] | None:
+        """Replace the skinning weights away from the surface in poses [P, J, 3]; called periodically in training.
+
+        Returns:
+            The parameter that has changed, and which of its rows, bool; None if nothing has changed.
+        """
+        return None
 
     def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Shrink the active cells to the final shape in poses [P, J, 3]."""

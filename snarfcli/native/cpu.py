@@ -193,11 +193,14 @@ def total_variation(weights: Tensor, size: Sequence[float], used: Tensor | None)
     """Return the change of weights [D, H, W, J] from node to node, [], and its gradient; see `variation.total_variation`."""
     weights, used = weights.contiguous(), None if used is None else used.contiguous()
     depth, height, width, count = weights.shape
+    if used is not None and (used.shape != weights.shape[:3] or used.dtype != torch.bool):
+        raise ValueError(f"used: wanted bool {list(weights.shape[:3])}, got {used.dtype} {list(used.shape)}")
     nodes = (c_int32 * 3)(width, height, depth)
     place = None if used is None else used.data_ptr()
     given = _Variation(weights.data_ptr(), place, nodes, count, (c_double * 3)(*size), torch.get_num_threads())
     total, gradient = c_double(), torch.empty_like(weights)
-    _raise_for(_library().snarf_total_variation(byref(given), byref(total), c_void_p(gradient.data_ptr())))
+    code = _library().snarf_total_variation(byref(given), byref(total), c_void_p(gradient.data_ptr()))
+    _raise_for(code, "the loss on the skinning weights ran out of memory; give a smaller skinning.resolution")
     return weights.new_tensor(total.value), gradient
 
 
@@ -261,8 +264,11 @@ def _search(function: str, field: _Field, points: Tensor, settings: Structure) -
     return canonical, query, inverse
 
 
-def _raise_for(code: int) -> None:
+_OUT_OF_MEMORY = "the correspondence search ran out of memory; give fewer points or poses at once"
+
+
+def _raise_for(code: int, out_of_memory: str = _OUT_OF_MEMORY) -> None:
     if code == 2:
-        raise MemoryError("the correspondence search ran out of memory; give fewer points or poses at once")
+        raise MemoryError(out_of_memory)
     if code:
         raise RuntimeError(f"the native library rejected its arguments (code {code})")

@@ -260,6 +260,8 @@ def encode_backward(
 
 def _codes(seen: Tensor, pose: Tensor, poses: int, size: int) -> _Codes:
     count, parts = seen.shape
+    if tuple(pose.shape) != (count,) or pose.dtype != torch.int64:
+        raise ValueError(f"pose: wanted int64 [{count}], got {pose.dtype} {list(pose.shape)}")
     return _Codes(seen.data_ptr(), pose.data_ptr(), count, poses, parts, size, torch.get_num_threads())
 
 
@@ -268,6 +270,8 @@ def pose_codes(seen: Tensor, codes: Tensor, pose: Tensor) -> Tensor:
     library = native_library()
     assert library is not None
     seen, codes, pose = seen.contiguous(), codes.contiguous(), pose.contiguous()
+    if codes.ndim != 3 or codes.shape[1] != seen.shape[1]:
+        raise ValueError(f"codes: wanted shape [B, {seen.shape[1]}, K], got {list(codes.shape)}")
     out = codes.new_empty(len(seen), codes.shape[2])
     _check(library.snarf_pose_codes(byref(_codes(seen, pose, len(codes), codes.shape[2])), _pointer(codes), _pointer(out)))
     return out
@@ -278,6 +282,8 @@ def pose_codes_backward(gradient: Tensor, seen: Tensor, pose: Tensor, poses: int
     library = native_library()
     assert library is not None
     seen, gradient, pose = seen.contiguous(), gradient.contiguous(), pose.contiguous()
+    if gradient.ndim != 2 or len(gradient) != len(seen):
+        raise ValueError(f"gradient: wanted shape [{len(seen)}, K], got {list(gradient.shape)}")
     size = gradient.shape[1]
     v_codes = gradient.new_empty(poses, seen.shape[1], size)
     _check(library.snarf_pose_codes_backward(byref(_codes(seen, pose, poses, size)), _pointer(gradient), _pointer(v_codes)))

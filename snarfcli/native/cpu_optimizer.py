@@ -60,6 +60,8 @@ def adam_step(
     arrays = (_Parameters * max(len(values), 1))()
     for index, tensors in enumerate(zip(values, gradients, first, second, averages, strict=True)):
         value = tensors[0]
+        if any(t.shape != value.shape or t.dtype != torch.float32 or not t.is_contiguous() for t in tensors):
+            raise ValueError(f"parameter {index}: wanted contiguous float32 {list(value.shape)} for all of its five arrays")
         rows = len(value) if value.ndim else 1
         pointers = (tensor.data_ptr() for tensor in tensors)
         columns = max(value.numel() // max(rows, 1), 1)

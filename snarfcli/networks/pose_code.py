@@ -35,6 +35,8 @@ def pose_code(seen: Tensor, codes: Tensor, pose: Tensor) -> Tensor:
         seen: [N, P], share of each part at each point.
         codes: [B, P, K], code of each part in each pose.
         pose: [N], index of each point's pose, 0 to B - 1.
+
+    No gradient reaches `seen`.
     """
     return pose_code_reference(seen, codes, pose).contiguous()
 

@@ -119,9 +119,10 @@ _TABLE2 = Experiment(
     "Learning strategies and grids of the skinning weights (Fast-SNARF Table 2)",
     (
         _SNARF,
-        Row("fast_snarf-broyden", "Fast-SNARF, grid of skinning=coarse", _BROYDEN, _NETWORKS, "fast_snarf"),
+        Row("fast_snarf-broyden", "Fast-SNARF, grid of the preset's network", _BROYDEN, _NETWORKS, "fast_snarf"),
         Row("voxel", "w/o MLP distillation, 64 x 64 x 16",
-            (*_BROYDEN, "skinning=voxel", "skinning.resolution=[64,64,16]"), ("shape=small",), "voxel"),
+            (*_BROYDEN, "skinning=voxel", "skinning.resolution=[64,64,16]"),
+            ("shape=small", "training.extend_weights_every=0"), "voxel"),
         _grid("grid16", (16, 16, 4), "grid16"),
         _grid("grid32", (32, 32, 8), "grid32"),
         _grid("grid64", (64, 64, 16), "grid64"),

@@ -22,20 +22,20 @@ _EPSILON = 1e-8
 class AveragedAdam:
     """Adam with a faster learning rate for feature grids, and an exponential moving average of the parameters.
 
-    Values at the nodes of a grid (features, logits of skinning weights) that no point of a step has touched keep their values
-    and moments in it.
+    Rows at the nodes of a grid (features, logits of skinning weights) that have no gradient in a step keep their values and
+    moments in it.
 
     Args:
         model: the system whose parameters are trained.
         config: learning rates and decay of the average.
 
-    Source: Kingma and Ba, Adam, ICLR 2015, Algorithm 1; untouched features after Mueller et al., SIGGRAPH 2022, Sec. 4.
+    Source: Kingma and Ba, Adam, ICLR 2015, Algorithm 1; rows without a gradient after Mueller et al., SIGGRAPH 2022, Sec. 4.
     """
 
     def __init__(self, model: nn.Module, config: TrainingConfig) -> None:
         self._model, self._config = model, config
         self.parameters = self._trained()
-        self.average = [parameter.detach().clone() for parameter in self.parameters]
+        self.average = [_copy(parameter.detach()) for parameter in self.parameters]
         self._first = [torch.zeros_like(value) for value in self.average]
         self._second = [torch.zeros_like(value) for value in self.average]
         names = [name for name, parameter in model.named_parameters() if parameter.requires_grad]
@@ -63,7 +63,7 @@ class AveragedAdam:
         gradients = [self.parameters[index].grad for index in used]
         values = [self.parameters[index].detach() for index in used]
         rates = [learning_rate * (self._config.feature_rate if self._are_features[index] else 1.0) for index in used]
-        is_native = all(value.device.type == "cpu" and value.dtype == torch.float32 for value in values)
+        is_native = all(v.device.type == "cpu" and v.dtype == torch.float32 and v.is_contiguous() for v in values)
         run = adam_step if is_native and choose_backend("auto") == "native" else adam_step_reference
         return run(
             values,
@@ -92,6 +92,15 @@ class AveragedAdam:
                 moments[index] = torch.cat([moments[index], torch.zeros_like(added)])
         self.parameters = grown
 
+    @torch.no_grad()
+    def restart(self, parameter: nn.Parameter, rows: Tensor) -> None:
+        """Forget what was known about some rows, bool [R], of a parameter that have new values."""
+        for index, mine in enumerate(self.parameters):
+            if mine is parameter:
+                self.average[index][rows] = parameter.detach()[rows]
+                self._first[index][rows] = 0
+                self._second[index][rows] = 0
+
     def state(self) -> dict[str, Any]:
         """Return what the coming steps depend on, besides the parameters."""
         moments = {"first": self._first, "second": self._second}
@@ -118,7 +127,11 @@ class AveragedAdam:
     def _like(value: Tensor, parameter: Tensor) -> Tensor:
         if value.shape != parameter.shape:
             raise ValueError(f"wanted {list(parameter.shape)} numbers of the optimiser, got {list(value.shape)}")
-        return value.to(parameter.detach()).clone()
+        return _copy(value.to(parameter.detach()))
+
+
+def _copy(value: Tensor) -> Tensor:
+    return value.clone(memory_format=torch.contiguous_format)
 
 
 def adam_step_reference(

@@ -50,8 +50,8 @@ class TrainingConfig:
     refresh_cells_every: int = MISSING
     """Steps between two updates of the searched cells from the learned shape; 0 keeps the first cells."""
     extend_weights_every: int = MISSING
-    """Steps after which skinning weights at nodes away from the surface, which no sample determines, are replaced by harmonic
-    ones, again and again; 0 never. Only for skinning=voxel."""
+    """Steps between two replacements of the skinning weights at nodes away from the surface by harmonic ones; 0 never. Only for
+    skinning=voxel."""
     precision: str = MISSING
     """Arithmetic of the shape network: highest, high, medium or bfloat16; the search is always in full float32."""
     validate_every: int = MISSING

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import asdict, replace
-from functools import reduce
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -104,14 +104,18 @@ class Trainer:
 
     def _maintain_grids(self) -> None:
         """Let the grids follow the shape, in the steps in which this is due."""
-        for every, update in (
-            (self.config.extend_weights_every, self.model.extend_weights),
-            (self.config.refresh_cells_every, self.model.refresh_cells),
-        ):
-            if every and self.step and self.step % every == 0:
-                generator = np.random.default_rng([self.seed, self.step, 2])
-                update(self.batches.poses(_POSES_OF_A_REFRESH, generator), self.config.precision)
-                self.optimizer.follow_growth()
+        poses = partial(self.batches.poses, _POSES_OF_A_REFRESH)
+        if self._is_due(self.config.extend_weights_every):
+            replaced = self.model.extend_weights(poses(np.random.default_rng([self.seed, self.step, 3])), self.config.precision)
+            if replaced is not None:
+                self.optimizer.restart(*replaced)
+        if self._is_due(self.config.refresh_cells_every):
+            self.model.refresh_cells(poses(np.random.default_rng([self.seed, self.step, 2])), self.config.precision)
+            self.optimizer.follow_growth()
+
+    def _is_due(self, every: int) -> bool:
+        """Return whether the coming step is one of every `every`; 0 is never."""
+        return every > 0 and self.step > 0 and self.step % every == 0
 
     def _check_finite(self, what: str, value: float) -> None:
         """Raise Diverged for a step that would spoil the weights, and that is not taken."""

@@ -128,8 +128,6 @@ def test_native_variation_equals_the_reference(shape, share):
     used = None if share is None else torch.rand(shape[:3], generator=generator) < share
     size = [0.1, 0.2, 0.05]
     given = weights.double().requires_grad_()
-    if min(shape[:3]) == 1 and share is None:
-        return  # the mean over no neighbours is none
     wanted = variation_reference(given, size, used)
     results = []
     before = torch.get_num_threads()
@@ -156,7 +154,7 @@ def test_extended_weights_are_means_of_their_neighbours(softmax):
     field = VoxelWeights(softmax, unit_grid(), (5, 6, 7), sharpness=5.0)
     with torch.no_grad():
         field.logits.normal_(generator=torch.Generator().manual_seed(0))
-    before = field.at_nodes().reshape(5, 6, 7, 4)
+    before = field.at_nodes().detach().reshape(5, 6, 7, 4)
     kept = torch.zeros(5, 6, 7, dtype=torch.bool)
     kept[2, 2:4, 3] = kept[0, 0, 0] = True
     field.extend_from(kept)

@@ -318,3 +318,25 @@ def test_what_a_system_lacks_is_rejected(store):
         avatar.model.choose_search(SearchConfig("broyden"))
     with pytest.raises(ValueError, match="model back_d has no skinning weights"):
         new_system(store, "back_d").skinning_weights(torch.zeros(1, 3))
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_settings_of_the_quick_preset_suit_every_system(store, name):
+    config = avatar_config(capsules=True)
+    if name == "snarf":
+        config = replace(config, search=SearchConfig("broyden", max_steps=20))
+    config = replace(
+        config,
+        model=ModelConfig(name),
+        skinning=replace(config.skinning, name="voxel", smoothness=1e-4),
+        shape=replace(config.shape, name="grid", feature_cells_m=[0.2, 0.1]),
+    )
+    surface = rough_canonical_points(store)
+    grid = CanonicalGrid.around(surface, config.skinning.margin_m)
+    avatar = Avatar(config, store.skeleton, grid, surface, {}, template=store.template)
+    training = training_config(steps=3, refresh_cells_every=2, extend_weights_every=2)
+    trainer = Trainer(avatar, store, training, 0, CPU)
+    numbers = [trainer.advance() for _ in range(3)]
+    assert ("smoothness" in numbers[0]) == (name == "fast_snarf")
+    again = Avatar.from_dict(trainer.finished_avatar().to_dict())
+    assert again.config.model.name == name

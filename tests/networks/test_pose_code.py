@@ -58,3 +58,15 @@ def test_a_pose_that_does_not_exist_is_refused():
     seen, codes, pose = made(9, 2, 5, 3)
     with pytest.raises(RuntimeError, match="rejected its arguments"):
         pose_code(seen, codes, pose + 1)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    seen, codes, pose = made(9, 2, 5, 3)
+    with pytest.raises(ValueError, match=r"codes: wanted shape \[B, 5, K\], got \[2, 4, 3\]"):
+        pose_code(seen, codes[:, :4], pose)
+    with pytest.raises(ValueError, match=r"pose: wanted int64 \[9\], got torch.int64 \[8\]"):
+        pose_code(seen, codes, pose[:8])
+    with pytest.raises(ValueError, match=r"pose: wanted int64 \[9\], got torch.int32 \[9\]"):
+        pose_code(seen, codes, pose.int())
+    with pytest.raises(ValueError, match=r"gradient: wanted shape \[9, K\], got \[8, 3\]"):
+        pose_code_backward(torch.ones(8, 3), seen, pose, 2)

@@ -150,3 +150,29 @@ def test_a_gradient_that_is_not_finite_changes_nothing(run, wrong):
     assert not math.isfinite(run(*given, *SETTINGS))
     for kind in (0, 2, 3, 4):
         assert all(torch.equal(a, b) for a, b in zip(given[kind], before[kind], strict=True))
+
+
+def test_rows_with_new_values_start_afresh():
+    model = Model()
+    optimizer = AveragedAdam(model, training_config())
+    steps(model, optimizer, 3)
+    table = model.grids.table
+    rows = torch.zeros(len(table), dtype=torch.bool)
+    rows[[1, 4]] = True
+    with torch.no_grad():
+        table[rows] = 7.0
+    kept = optimizer.average[1][~rows].clone()
+    optimizer.restart(table, rows)
+    assert (optimizer.average[1][rows] == 7).all()
+    assert torch.equal(optimizer.average[1][~rows], kept)
+    moments = optimizer.state()["optimizer"]
+    for name in ("first", "second"):
+        assert (moments[name][1][rows] == 0).all()
+        assert (moments[name][1][:4][~rows[:4]] != 0).any()
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    given = arrays(0)
+    given[2][3] = given[2][3][:-1]
+    with pytest.raises(ValueError, match=r"parameter 3: wanted contiguous float32 \[40001, 4\]"):
+        adam_step(*given, *SETTINGS)

@@ -64,7 +64,7 @@ def test_smoke_is_one_small_folder_for_every_command(capsys):
     assert root != composed(capsys, "train")["data_root"]  # full samples are not changed
     assert len({config["output_root"] for name, config in configs.items() if name != "preprocess"}) == 1
     assert configs["train"]["training"]["name"] == "smoke"
-    assert configs["train"]["shape"]["width"] == 128
+    assert configs["train"]["shape"]["name"] == "grid"
     # 240 frames per training sequence: some must remain for training beside those for validation.
     assert 2 <= 240 / configs["preprocess"]["data"]["frame_step"] <= 10
 

@@ -64,7 +64,7 @@ def test_backend_names():
 
 
 def test_without_a_library_auto_warns_once_and_native_raises(no_library):
-    with pytest.warns(RuntimeWarning, match=f"reference in PyTorch.*there is no .* in {no_library}") as caught:
+    with pytest.warns(RuntimeWarning, match=f"references in PyTorch.*there is no .* in {no_library}") as caught:
         chosen = [choose_backend("auto") for _ in range(2)]
     assert chosen == ["reference", "reference"]
     assert len(caught) == 1
@@ -76,7 +76,7 @@ def test_without_a_library_auto_warns_once_and_native_raises(no_library):
 
 
 def test_a_device_without_kernels_is_named(fresh):
-    with pytest.warns(RuntimeWarning, match="reference in PyTorch.*there are no kernels for tensors on mps") as caught:
+    with pytest.warns(RuntimeWarning, match="references in PyTorch.*there are no kernels for tensors on mps") as caught:
         chosen = [choose_backend("auto", "mps") for _ in range(2)]
     assert chosen == ["reference", "reference"]
     assert len(caught) == 1

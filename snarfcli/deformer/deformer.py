@@ -53,6 +53,7 @@ class ForwardDeformer(nn.Module):
     upper: Tensor
     active_cells: Tensor
     """[D-1, H-1, W-1], bool, the cells that a complete search looks into; see `set_active_cells`."""
+    _used_nodes: Tensor
     _active_nodes: Tensor
     _active_points: Tensor
     field: Callable[[Tensor], Tensor]
@@ -85,6 +86,7 @@ class ForwardDeformer(nn.Module):
         self.register_buffer("lower", grid.lower.clone())
         self.register_buffer("upper", grid.upper.clone())
         self.register_buffer("active_cells", torch.ones([n - 1 for n in self.shape], dtype=torch.bool))
+        self.register_buffer("_used_nodes", torch.empty(0, dtype=torch.bool), persistent=False)
         self.register_buffer("_active_nodes", torch.empty(0, dtype=torch.long), persistent=False)
         self.register_buffer("_active_points", torch.empty(0, 3), persistent=False)
         self.set_active_cells(self.active_cells if active_cells is None else active_cells)
@@ -236,8 +238,9 @@ class ForwardDeformer(nn.Module):
         self._update_active_nodes()
 
     def _update_active_nodes(self) -> None:
-        """Keep the nodes of active cells, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
-        self._active_nodes = corners_of(self.active_cells).reshape(-1).nonzero()[:, 0]
+        """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
+        self._used_nodes = corners_of(self.active_cells)
+        self._active_nodes = self._used_nodes.reshape(-1).nonzero()[:, 0]
         self._active_points = self.grid.nodes(self.shape).reshape(-1, 3)[self._active_nodes]
 
     def is_active(self, canonical: Tensor) -> Tensor:
@@ -278,7 +281,7 @@ class ForwardDeformer(nn.Module):
             weights: from `node_weights`, if they have been evaluated already.
         """
         values = self.weight_grid(active_only=True) if weights is None else weights.values
-        return total_variation(values, self.grid, corners_of(self.active_cells))
+        return total_variation(values, self.grid, self._used_nodes)
 
 
 def _make_field(

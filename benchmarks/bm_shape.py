@@ -2,7 +2,7 @@
 
     python benchmarks/bm_shape.py
 
-Untrained networks of the sizes of the papers and of the quick training, with global and local pose condition.
+Untrained networks of the sizes of the papers and of shape=small, with global and local pose condition.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from snarfcli.shape.inference import evaluate
 _JOINTS = 23
 _SIZES = {
     "papers': 8 x 256, softplus": ShapeConfig(),
-    "quick: 6 x 128, ReLU, waves, capsules": ShapeConfig(
+    "small: 6 x 128, ReLU, waves, capsules": ShapeConfig(
         width=128, depth=6, activation="relu", skip_layers=[], frequencies=[2.0, 4.0, 8.0, 16.0], condition_layer=2,
         condition_size=16, geometric_init=False, weight_norm=False, prior_radius_m=0.07,
     ),

@@ -67,6 +67,7 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_shape.py
 	$(VENV)/bin/python benchmarks/bm_networks.py
 	$(VENV)/bin/python benchmarks/bm_surfaces.py
+	$(VENV)/bin/python benchmarks/bm_loose_pieces.py
 	$(VENV)/bin/python benchmarks/bm_video.py
 
 clean:

@@ -39,7 +39,8 @@ PROTOCOL = {
     "correspondences_per_point": "mean over points that have any; several_correspondences: share of points with two or more",
     "without_correspondence": "shares of the points of all frames together",
     "weights": "at the vertices of the body's mesh in the canonical pose, against its own; wrong_share: half the sum "
-    "of the absolute differences over bones; right_bone: share of vertices whose heaviest bone is the same",
+    "of the absolute differences over bones; right_bone: share of vertices whose heaviest bone is the same; "
+    "precision, recall: of a vertex's influences (weights above 0.01), mean over vertices; l1_norm: twice wrong_share",
     "surfaces": "Chamfer: mean of the two mean distances; normals: mean cosine at nearest places; F-score: within 5 mm",
     "timings": "one untimed call first; times for 200,000 points are scaled from calls of points_per_frame points",
 }

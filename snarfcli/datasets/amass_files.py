@@ -20,17 +20,22 @@ from snarfcli.datasets.splits import Split
 from snarfcli.datasets.subjects import SequenceSpec, body_sequence
 from snarfcli.errors import UserError
 from snarfcli.motions import read_motion, read_shape
+from snarfcli.motions.up_axis import Up
 
 __all__ = [
+    "SMPL_BETAS",
     "AmassSubject",
     "amass_sequences",
     "find_sequences",
     "find_subjects",
     "papers_split",
     "read_amass_subject",
+    "sequence_name",
     "walk_files",
 ]
 
+SMPL_BETAS = 10
+"""Number of shape parameters that are used, the first ones, as in the papers."""
 _DEPTH = 7  # archives unpack to at most three nested folders, which are often inside further folders
 _LEFT_OUT = {
     "processed", "outputs",  # written by snarf
@@ -46,14 +51,20 @@ def papers_split() -> dict:
     return cast(dict, OmegaConf.to_container(OmegaConf.load(Path(__file__).with_name("dfaust_split.yaml"))))
 
 
-def walk_files(root: Path, suffix: str = ".npz") -> Iterator[Path]:
-    """Yield the files with a suffix, at most seven folders deep, in a fixed order; links are followed."""
+def walk_files(root: Path, left_out: Iterable[str] = _LEFT_OUT) -> Iterator[Path]:
+    """Yield the `.npz` files at most seven folders deep, in a fixed order; links are followed, hidden folders are not.
+
+    Args:
+        root: the folder.
+        left_out: names of folders, in lower case, that are not searched.
+    """
+    left_out = set(left_out)
     for folder, names, files in os.walk(root, followlinks=True):
         depth = len(Path(folder).relative_to(root).parts)
-        wanted = (name for name in names if name.lower() not in _LEFT_OUT and not name.startswith("."))
+        wanted = (name for name in names if name.lower() not in left_out and not name.startswith("."))
         names[:] = sorted(wanted) if depth < _DEPTH else []
         for file in sorted(files):
-            if file.lower().endswith(suffix):
+            if file.lower().endswith(".npz"):
                 yield Path(folder) / file
 
 
@@ -75,6 +86,12 @@ def find_sequences(root: Path, subject: str, names: Iterable[str]) -> dict[str, 
             rank = (_KINDS.index(match[3].lower()), len(path.parts), str(path), path)
             found.setdefault(match[2].lower(), []).append(rank)
     return {name: min(ranks)[3] for name, ranks in found.items()}
+
+
+def sequence_name(path: Path) -> str:
+    """Return the name of a file without the ending of AMASS: hips for `hips_poses.npz` and `hips_stageii.npz`."""
+    kind = next((kind for kind in _KINDS if path.stem.lower().endswith(kind)), "")
+    return path.stem[: len(path.stem) - len(kind)]
 
 
 def find_subjects(root: Path, subjects: Iterable[str]) -> tuple[str, ...]:
@@ -108,7 +125,7 @@ def read_amass_subject(files: Mapping[str, Path], request: DataRequest) -> Amass
     shape, gender, betas = _first_shape(beside[:1] or list(files.values()))
     path = find_body(request.body or request.data_root, "smpl", gender)
     body = load_body(path)
-    betas = betas[: min(len(betas), _SMPL_BETAS, body.num_betas)]
+    betas = betas[: min(len(betas), SMPL_BETAS, body.num_betas)]
     # The shape space of SMPL-X differs from that of SMPL.
     caution = " (made for SMPL-X: gives another shape with SMPL)" if shape.stem.lower().endswith("_stageii") else ""
     sources = (f"body {path} ({gender})", f"shape {shape}{caution}", f"motions {next(iter(files.values())).parent}")
@@ -126,11 +143,14 @@ def _first_shape(files: Sequence[Path]) -> tuple[Path, str, NDArray[np.float64]]
     raise problem or ValueError("files: wanted at least one")
 
 
-_SMPL_BETAS = 10  # the papers use the first ten
-
-
 def amass_sequences(
-    files: Mapping[str, Path], splits: Mapping[str, Split], person: AmassSubject, hands: str, where: Path
+    files: Mapping[str, Path],
+    splits: Mapping[str, Split],
+    person: AmassSubject,
+    hands: str,
+    where: Path,
+    *,
+    up: Up = "z",
 ) -> tuple[list[SequenceSpec], list[tuple[str, str]]]:
     """Read sequences without their translation, as in the papers.
 
@@ -140,6 +160,7 @@ def amass_sequences(
         person: the subject.
         hands: see `read_motion`.
         where: folder that was searched, for messages.
+        up: up axis of the files; z in AMASS.
 
     Returns:
         sequences: the sequences that were read.
@@ -151,7 +172,7 @@ def amass_sequences(
             broken.append((name, f"has no file below {where}"))
             continue
         try:
-            motion = read_motion(files[name], person.skeleton, up="z", hands=hands)
+            motion = read_motion(files[name], person.skeleton, up=up, hands=hands)
         except UserError as error:
             broken.append((name, str(error)))
             continue

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from snarfcli.bodies import builtin_body
-from snarfcli.datasets.amass import papers_split
+from snarfcli.datasets.amass_files import papers_split
 from snarfcli.motions import builtin_motion
 
 FRAMES = 4

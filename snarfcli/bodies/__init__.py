@@ -2,7 +2,7 @@
 
 from snarfcli.bodies.body import Body, PosedBody
 from snarfcli.bodies.builtin import builtin_body
-from snarfcli.bodies.finding import BODY_KINDS, GENDERS, find_body
+from snarfcli.bodies.finding import BODY_KINDS, GENDERS, BodyNotFound, find_body
 from snarfcli.bodies.kinematics import (
     axis_angle_to_matrix,
     forward_kinematics,
@@ -21,6 +21,7 @@ __all__ = [
     "SMPLX_JOINT_NAMES",
     "SMPL_JOINT_NAMES",
     "Body",
+    "BodyNotFound",
     "MeshTemplate",
     "PosedBody",
     "Skeleton",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from snarfcli.errors import UserError
 
-__all__ = ["BODY_KINDS", "GENDERS", "find_body"]
+__all__ = ["BODY_KINDS", "GENDERS", "BodyNotFound", "find_body"]
 
 BODY_KINDS = ("smpl", "smplh", "smplx")
 GENDERS = ("female", "male", "neutral")
@@ -55,6 +55,10 @@ class _Found:
         return BODY_KINDS.index(self.kind), version, self.is_copy, is_pickle, self.depth, str(self.path)
 
 
+class BodyNotFound(UserError):
+    """There is no body model of the wanted kind and gender in a place."""
+
+
 def find_body(place: str | Path, kind: str | None, gender: str) -> Path:
     """Find the body model file of a gender.
 
@@ -72,8 +76,8 @@ def find_body(place: str | Path, kind: str | None, gender: str) -> Path:
         The file, never that of another gender.
 
     Raises:
-        UserError: the place does not exist or has no such model (the message lists what was found), or the kind or gender is
-            unknown.
+        BodyNotFound: the place does not exist or has no such model; the message lists what was found.
+        UserError: the kind or gender is unknown, or the folder is too large to search.
     """
     place = Path(place).expanduser()
     wanted = _LETTERS.get(gender.strip().lower()[:1], "")
@@ -84,7 +88,7 @@ def find_body(place: str | Path, kind: str | None, gender: str) -> Path:
     if place.is_file():
         return place
     if not place.is_dir():
-        raise UserError(f"no body model at {place}; name a model file or a folder of model files")
+        raise BodyNotFound(f"no body model at {place}; name a model file or a folder of model files")
     found = sorted(_search(place), key=lambda one: one.preference)
     for one in found:
         if one.gender == wanted and kind in (None, one.kind):
@@ -93,7 +97,7 @@ def find_body(place: str | Path, kind: str | None, gender: str) -> Path:
     names = ", ".join(names for of, names in _NAMES.items() if kind in (None, of))
     names = names.format(letter=wanted if wanted == "neutral" else wanted[0], gender=wanted, GENDER=wanted.upper())
     there = ", ".join(str(one.path.relative_to(place)) for one in found[:6]) + (", ..." if len(found) > 6 else "")
-    raise UserError(
+    raise BodyNotFound(
         f"no {wanted} {title} model in {place}; wanted {names}, got {there or 'no model'}; download it, or name a model file"
     )
 

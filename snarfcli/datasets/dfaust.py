@@ -9,7 +9,7 @@ import logging
 from pathlib import Path
 
 from snarfcli.checks import check_choice
-from snarfcli.datasets.amass import amass_sequences, find_sequences, find_subjects, papers_split, read_amass_subject
+from snarfcli.datasets.amass_files import amass_sequences, find_sequences, find_subjects, papers_split, read_amass_subject
 from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.splits import Split, same_split
 from snarfcli.datasets.subjects import SubjectData, body_template

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from snarfcli.datasets import dfaust
-from snarfcli.datasets.amass import amass_sequences, find_sequences, papers_split, read_amass_subject
+from snarfcli.datasets.amass_files import amass_sequences, find_sequences, papers_split, read_amass_subject
 from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.splits import same_split
 from snarfcli.datasets.subjects import SubjectData, body_template

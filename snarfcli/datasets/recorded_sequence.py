@@ -12,7 +12,7 @@ from snarfcli.bodies import pose_from_transforms
 from snarfcli.bodies.skeleton import Skeleton
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
 from snarfcli.datasets.skeleton_files import PoseFile
-from snarfcli.datasets.splits import Split
+from snarfcli.datasets.splits import Split, held_back_start
 from snarfcli.datasets.subjects import SequenceSpec
 from snarfcli.motions import Motion
 
@@ -23,7 +23,6 @@ PERSON_M = 1.8
 
 _NEAR_A_PERSON_M = (1.2, 2.4)
 _TOLERANCE_M = 1e-3  # poses that reproduce the bone transforms within a millimetre replace them
-_TEST_SHARE = 0.2  # of the frames of a single sequence
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ class RecordedSequence:
         count = self.poses.num_frames
         if count < 2:
             return [self]
-        cut = count - max(1, round(_TEST_SHARE * count))
+        cut = held_back_start(count)
         return [self._part(self.name, slice(0, cut)), self._part(f"{self.name}_end", slice(cut, count))]
 
     def _part(self, name: str, frames: slice) -> RecordedSequence:

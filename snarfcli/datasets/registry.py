@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from snarfcli.datasets import builtin, cape, clothed, dfaust, meshes, poseprior, stick2d
+from snarfcli.datasets import amass, builtin, cape, clothed, dfaust, meshes, poseprior, stick2d
 from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError, nearest
@@ -33,6 +33,7 @@ class DataSet(Protocol):
 
 
 _DATASETS: dict[str, DataSet] = {
+    "amass": amass,
     "builtin": builtin,
     "cape": cape,
     "clothed": clothed,

@@ -14,7 +14,7 @@ class DataConfig:
     """Name of the data set, folders, and sampling of frames."""
 
     name: str = MISSING
-    """Name of the data set: builtin, clothed, dfaust, poseprior, cape, meshes or stick2d."""
+    """Name of the data set: builtin, clothed, amass, dfaust, poseprior, cape, meshes or stick2d."""
     frame_step: int = MISSING
     """Use every n-th frame of a training sequence."""
     test_frame_step: int = MISSING
@@ -26,14 +26,14 @@ class DataConfig:
     avatars: str | None = None
     """Data set whose avatars are evaluated on this one; null for this data set."""
     test: list[str] = field(default_factory=list)
-    """Names or patterns (such as walk*) of held-out sequences; empty for the split of the data set (cape, meshes)."""
+    """Names or patterns (such as walk*) of held-out sequences; empty for the split of the data set (amass, cape, meshes)."""
     ood: list[str] = field(default_factory=list)
-    """Names or patterns of out-of-distribution sequences; empty for those of the data set (cape, meshes)."""
+    """Names or patterns of out-of-distribution sequences; empty for those of the data set (amass, cape, meshes)."""
     hands: str = "rest"
     """SMPL's hand joints for files with SMPL-H poses: rest (zero), or released (columns 66 to 72, as in the papers' code)."""
     scale: str = "auto"
     """Metres per unit of the files, for meshes; auto: 1 for a subject of a person's size, else what gives it that size."""
     up: str = "auto"
-    """Up axis of the files, for meshes: auto, y or z."""
+    """Up axis of the files, for amass and meshes: auto, y or z."""
     canonical: str = "auto"
     """Canonical pose, for meshes: rest; legs_apart (SNARF's, if rest is a T-pose); auto (from the skeleton file, else rest)."""

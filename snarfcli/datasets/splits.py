@@ -8,13 +8,14 @@ from typing import Literal
 
 from snarfcli.errors import UserError, nearest
 
-__all__ = ["SPLITS", "Split", "same_split", "split_sequences"]
+__all__ = ["SPLITS", "Split", "held_back_start", "same_split", "split_sequences"]
 
 Split = Literal["train", "test", "ood"]
 SPLITS: tuple[Split, ...] = ("train", "test", "ood")
 """Training motion, held-out motion of the same kind, out-of-distribution motion; in this order everywhere."""
 
-_TEST_SHARE = 0.2
+_TEST_SHARE = 0.2  # of the sequences, or of the frames of a sequence
+_LISTED = 12  # names in a message
 
 
 def same_split(names: Iterable[str], split: Split) -> dict[str, Split]:
@@ -22,16 +23,22 @@ def same_split(names: Iterable[str], split: Split) -> dict[str, Split]:
     return dict.fromkeys(names, split)
 
 
-def split_sequences(names: Sequence[str], test: Sequence[str], ood: Sequence[str]) -> dict[str, Split]:
+def held_back_start(num_frames: int) -> int:
+    """Return the first frame of the part of a sequence that is held back for testing: its last fifth, at least one frame."""
+    return num_frames - max(1, round(_TEST_SHARE * num_frames))
+
+
+def split_sequences(names: Sequence[str], test: Sequence[str], ood: Sequence[str], *, fewest: int = 2) -> dict[str, Split]:
     """Return the split of each sequence.
 
     Sequences that match a pattern of `test` or `ood` are held out. Without patterns, names that start with `ood` are out of
-    distribution, and the last fifth of the others is for testing.
+    distribution, and the last fifth of the others, at least one, is for testing.
 
     Args:
         names: names of the sequences.
         test: names or patterns of sequences for testing; the last match of a pattern counts.
         ood: names or patterns of out-of-distribution sequences.
+        fewest: of fewer other sequences, none is for testing without a pattern; the caller can hold back a part of each.
 
     Raises:
         UserError: a pattern matches no sequence, or no sequence is left to train on.
@@ -42,14 +49,22 @@ def split_sequences(names: Sequence[str], test: Sequence[str], ood: Sequence[str
         for pattern in patterns:
             matches = [name for name in names if fnmatch(name, pattern)]
             if not matches:
-                raise UserError(f"data.{split}: no sequence '{pattern}'{nearest(pattern, names)}; there is {', '.join(names)}")
+                raise UserError(f"data.{split}: no sequence '{pattern}'{nearest(pattern, names)}; there is {_listed(names)}")
             chosen.update(dict.fromkeys(matches, split))
     if not ood:
         chosen.update({name: "ood" for name in names if name not in chosen and name.lower().startswith("ood")})
     left = [name for name in names if name not in chosen]
-    if not test and len(left) > 1:
+    if not test and len(left) >= fewest:
         count = max(1, round(_TEST_SHARE * len(left)))
         chosen.update(dict.fromkeys(left[-count:], "test"))
     if not set(names) - set(chosen):
-        raise UserError(f"no sequence is left to train on: {', '.join(names)} are all held out; give fewer in data.test")
+        by_name = "" if ood else " (without data.ood, names that start with ood are)"
+        raise UserError(
+            f"no sequence is left to train on: {_listed(names)} are all held out{by_name}; name fewer in data.test and data.ood"
+        )
     return {name: chosen.get(name, "train") for name in names}
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more

@@ -20,21 +20,24 @@ _MAX_BETAS = 1000
 _TOLERANCE = 1e-4
 
 
-def read_shape(path: str | Path) -> tuple[str, NDArray[np.float64]]:
+def read_shape(path: str | Path, *, needs_betas: bool = True) -> tuple[str, NDArray[np.float64]]:
     """Read the gender and shape parameters from `shape.npz`, a `stagei.npz`, or any sequence of AMASS.
 
     Args:
         path: `.npz` file with `betas`, [S], or [T, S] with equal rows, and `gender` in any spelling, as text or bytes.
+        needs_betas: whether a file without `betas` is an error.
 
     Returns:
         gender: `male`, `female` or `neutral`; `neutral` if the file has none.
-        betas: [S], shape parameters; 10 or 16 in most files, of which SMPL uses the first 10.
+        betas: [S], shape parameters; 10 or 16 in most files, of which SMPL uses the first 10. Empty if the file has none.
 
     Raises:
         UserError: the file is missing or damaged; it has no shape, one that varies or is not finite, or an unknown gender.
     """
     path = Path(path)
     arrays = read_npz(path, "shape file", only=("betas", "gender"), max_bytes=2**24)
+    if "betas" not in arrays and not needs_betas:
+        return _gender(arrays, path), np.zeros(0)
     if "betas" not in arrays:
         raise UserError(f"shape file {path}: wanted 'betas', got none; give shape.npz or a sequence of the subject")
     betas = arrays["betas"]

@@ -10,7 +10,7 @@ import pytest
 from licensed_files import BETAS, amass_poses, write_body, write_dfaust, write_new, write_old
 
 from snarfcli.cli.main import main
-from snarfcli.datasets.amass import papers_split
+from snarfcli.datasets.amass_files import papers_split
 from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig

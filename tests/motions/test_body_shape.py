@@ -35,6 +35,13 @@ def test_sequences_and_rows(tmp_path):
     np.testing.assert_allclose(betas, BETAS, atol=1e-7)
 
 
+def test_betas_may_be_optional(tmp_path):
+    np.savez(tmp_path / "a.npz", gender="f")
+    gender, betas = read_shape(tmp_path / "a.npz", needs_betas=False)
+    assert gender == "female"
+    assert betas.shape == (0,)
+
+
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from toy_animal import animal_motion, make_animal
 from toy_animal_files import animal_glb, write_animal_meshes, write_mesh
 
+from snarfcli.bodies import axis_angle_to_matrix, matrix_to_axis_angle
 from snarfcli.commands import doctor
 from snarfcli.commands.doctor import DoctorConfig
 from snarfcli.datasets.settings import DataConfig
@@ -58,6 +60,7 @@ def test_a_good_folder_is_usable_and_drawn(caplog, good):
     assert line_with(lines, "scaled by")
     assert line_with(lines, "278 vertices, 552 faces, the same in all 6 frames")
     assert line_with(lines, "100 % of the joints are inside the meshes")
+    assert "  poses           surface at a bone moves by 0.2 cm between frames (median of 18 bones, 6 frames)" in lines
     assert f'usable; next: "snarf preprocess data=meshes subject=rex data.folder={good}"' in lines[-1]
     path = good.parent / "outputs" / "doctor" / "meshes_rex.png"
     assert str(path) in line_with(lines, "  figure ")
@@ -80,6 +83,25 @@ def test_skeletons_that_do_not_fit_are_a_problem(caplog, bad):
     assert "PROBLEM: 0 % of the joints are inside the meshes" in line_with(lines, "  fit ")
     assert "units, axes and frame order" in line_with(lines, "  fit ")
     assert lines[-1].startswith("not usable as it is: rex")
+
+
+@pytest.mark.parametrize(("degrees", "shift_m"), [(2, 0.01), (5, 0.02)])
+def test_poses_that_are_wrong_in_every_frame_are_a_warning(caplog, bad, degrees, shift_m):
+    random = np.random.default_rng(0)
+    for motion in MOTIONS:
+        path = bad / "rex" / motion.name / "poses.npz"
+        content = dict(np.load(path))
+        turns = torch.from_numpy(random.normal(0, np.deg2rad(degrees) / 1.6, motion.poses.shape))  # mean angle: 1.6 sigma
+        turned = axis_angle_to_matrix(torch.from_numpy(motion.poses)) @ axis_angle_to_matrix(turns)
+        shifts = random.normal(0, shift_m / np.sqrt(3), motion.translation.shape)
+        poses = matrix_to_axis_angle(turned).flatten(1).numpy()
+        np.savez(path, **content | {"poses": poses, "trans": content["trans"] + shifts})
+    code, lines = checked(caplog, bad)
+    assert code == 0
+    line = line_with(lines, "  poses           warning: surface at a bone moves by ")
+    assert "cm between frames (median of 18 bones, 6 frames), wanted less than 0." in line
+    assert "; training.refine_poses=true corrects the poses while training; or repair them" in line
+    assert lines[-1].startswith("usable; next:")
 
 
 def test_open_inside_out_and_oddly_sized_meshes_are_told(caplog, bad):

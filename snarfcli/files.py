@@ -10,7 +10,7 @@ import os
 import re
 import secrets
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -19,7 +19,17 @@ import numpy as np
 
 from snarfcli.errors import UserError, one_line
 
-__all__ = ["MAX_ARRAY_BYTES", "atomic_path", "file_digest", "read_json", "read_npy", "read_npz", "write_json", "write_tensors"]
+__all__ = [
+    "MAX_ARRAY_BYTES",
+    "atomic_path",
+    "file_digest",
+    "read_json",
+    "read_npy",
+    "read_npz",
+    "write_arrays",
+    "write_json",
+    "write_tensors",
+]
 
 MAX_ARRAY_BYTES = 2**30
 """Maximum total size of the arrays in one file, unless a reader sets another."""
@@ -82,6 +92,12 @@ def write_tensors(path: str | Path, content: Any) -> None:
     torch.save(content, buffer)
     with atomic_path(path) as temporary:
         temporary.write_bytes(buffer.getbuffer())
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write an `.npz` archive atomically."""
+    with atomic_path(path) as temporary:
+        np.savez(temporary, **arrays)  # pyright: ignore[reportArgumentType]  # stub: takes arrays for allow_pickle
 
 
 def read_json(path: str | Path, what: str = "file") -> Any:

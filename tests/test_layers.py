@@ -18,7 +18,7 @@ LAYERS = (
     ("commands",),
     ("reproduce",),
     ("training", "viewer"),
-    ("avatar", "evaluation"),
+    ("avatar", "evaluation", "fitting"),
     ("export", "rendering", "samples"),
     ("datasets", "meshing"),
     ("models", "motions"),

@@ -41,11 +41,11 @@ def training_config(**changes: object) -> TrainingConfig:
     """Return settings of a short training."""
     config = TrainingConfig(
         name="toy", steps=150, poses_per_step=3, uniform_points=200, surface_points=200, far_points=20, fresh_points=False,
-        workers=0, learning_rate=1e-2,
+        workers=0, agreement_weight=0.0, agreement_points=200, agreement_every=2, learning_rate=1e-2,
         feature_rate=3.0, final_learning_rate=0.05,
         warmup_steps=5, average_decay=0.95, bootstrap_steps=50, bone_occupancy_weight=0.1,
         bone_points=5, joint_weight=1.0, joint_target="halves", refresh_cells_every=40,
-        extend_weights_every=60, precision="highest",
+        extend_weights_every=60, refine_poses=False, precision="highest",
         validate_every=75, validation_frames=2, checkpoint_every=50,
     )  # fmt: skip
     return replace(config, **changes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,15 +18,18 @@ from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
-from snarfcli.evaluation.evaluate import evaluate
+from snarfcli.evaluation.evaluate import choose_frames, evaluate
 from snarfcli.evaluation.figure import write_figure
 from snarfcli.evaluation.report import SPLITS, STORE_SPLITS, EvaluationReport, metrics_content, table, timings_text
 from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
 from snarfcli.files import write_json
+from snarfcli.fitting import PoseRefiner, refined_poses_text
+from snarfcli.models.fast_snarf import FastSnarf
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
+from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.samples.store import SampleStore
 
 __all__ = ["EvalConfig", "run"]
@@ -57,6 +61,8 @@ class EvalConfig:
     """Number of frames to evaluate, evenly spaced; null for all."""
     points: int | None = MISSING
     """Number of points per frame, half uniform, half near the surface; null for all."""
+    refine_poses: bool = MISSING
+    """Fit the pose of every frame to its mesh first, for poses that are only nearly right; the results say so."""
     surface_frames: int = MISSING
     """Number of frames in which the surface is compared with the ground truth (Chamfer, normals, F-score); 0 disables this."""
     surface_resolution: int = MISSING
@@ -107,6 +113,7 @@ def run(config: EvalConfig) -> None:
     )  # fmt: skip
     log.info("avatar: %s, %s, on %s", path, f"search {search.name}" if search else avatar.config.model.name, device)
 
+    refined = _refine(config, avatar, sequences) if config.refine_poses else None
     start = time.perf_counter()
     frames = evaluate(
         avatar,
@@ -127,6 +134,7 @@ def run(config: EvalConfig) -> None:
         device=str(device),
         training=avatar.facts,
         search=asdict(search) if search else {},
+        refined_poses=refined,
         samples=store.manifest["settings"],
     )
     log.info("\n%s\n\n%s", table(evaluation), timings_text(evaluation))
@@ -170,6 +178,26 @@ def _check(config: EvalConfig) -> None:
         builtin_subject(config.subject)  # raises for an unknown subject, with the most similar name
 
 
+def _refine(config: EvalConfig, avatar: Avatar, sequences: Sequence[SequenceSamples]) -> dict[str, float]:
+    """Fit the poses of all frames that are measured to their meshes; return how much they changed.
+
+    Raises:
+        UserError: the avatar's system has no forward skinning.
+    """
+    if not isinstance(avatar.model, FastSnarf):
+        name = avatar.config.model.name
+        raise UserError(f"refine_poses: wanted an avatar of model fast_snarf or snarf, got {name}; leave refine_poses out")
+    refiner = PoseRefiner(sequences, avatar.skeleton, avatar.device, config.seed)
+    frames = choose_frames(sequences, config.max_frames)
+    if config.surface_frames:
+        known = {(id(sequence), index) for sequence, index in frames}
+        more = choose_frames(sequences, config.surface_frames)
+        frames += [(sequence, index) for sequence, index in more if (id(sequence), index) not in known]
+    refiner.refine_all(avatar, frames, desc="refine poses")
+    log.info("%s", refined_poses_text(refiner.poses.summary()))
+    return refiner.poses.summary()
+
+
 def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None:
     """Reject an avatar of another skeleton; warn about another subject or other training data."""
     theirs, ours = avatar.skeleton, store.skeleton
@@ -187,9 +215,12 @@ def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None
 def _folder_name(config: EvalConfig, avatar: Avatar) -> str:
     """Return the name of the output folder.
 
-    Results of another search, data set or subject, or of a part of the points, must not replace the full evaluation.
+    Results of refined poses, of another search, data set or subject, or of a part of the points, must not replace the full
+    evaluation.
     """
     parts = ["eval", config.split]
+    if config.refine_poses:
+        parts.append("refined")
     if config.search is not None:
         parts.append(config.search.name)
     if avatar.facts.get("data", config.data.name) != config.data.name:

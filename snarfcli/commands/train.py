@@ -22,6 +22,7 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
+from snarfcli.fitting import RefinedPoses, refined_poses_text
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
@@ -43,10 +44,11 @@ __all__ = ["TrainConfig", "new_trainer", "run"]
 
 log = logging.getLogger(__name__)
 
-_AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every")
+_AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every", "agreement_every")
 _NOT_NEGATIVE = (
     "uniform_points", "surface_points", "far_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight",
     "joint_weight", "validation_frames", "refresh_cells_every", "extend_weights_every", "workers",
+    "agreement_weight", "agreement_points",
 )  # fmt: skip
 _LEAST_OF_PARTS = {"part_width": 1, "part_depth": 1, "part_code": 0, "part_weight": 0, "part_points": 1}
 
@@ -147,6 +149,9 @@ def run(config: TrainConfig) -> None:
             raise
     finished = trainer.finished_avatar()
     finished.facts |= {"steps": trainer.step, "validation": result["validation"]}
+    if trainer.refiner is not None:
+        trainer.refiner.poses.write(folder / "refined_poses.npz")
+        _report_poses(trainer.refiner.poses, folder)
     finished.save(folder / "avatar.pt")
     write_json(folder / "metrics.json", _metrics(config, result, trainer, time.time() - start))
     validation = result["validation"]
@@ -157,6 +162,19 @@ def run(config: TrainConfig) -> None:
             100 * validation["iou_surface"],
         )
     log.info("avatar: %s", folder / "avatar.pt")
+
+
+def _report_poses(poses: RefinedPoses, folder: Path) -> None:
+    """Report the refined poses, and warn of those that do not fit the meshes."""
+    summary = poses.summary()
+    log.info("%s: %s", refined_poses_text(summary), folder / "refined_poses.npz")
+    failed, frames = poses.count_misfits(), poses.num_frames
+    if failed:
+        log.warning(
+            "warning: the poses of %d of %d frames could not be refined (their meshes are more than %.1f cm from the avatar); "
+            "the run is kept; leave these frames out, or start from better poses",
+            failed, frames, 100 * poses.misfit_m,
+        )  # fmt: skip
 
 
 def _check(config: TrainConfig) -> None:
@@ -261,6 +279,7 @@ def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seco
         "iou_surface": validation.get("iou_surface"),
         "frames": min(config.training.validation_frames, held_back),
         "steps": trainer.step,
+        "refined_poses": None if trainer.refiner is None else trainer.refiner.poses.summary(),
         "timings": {"wall_s": round(seconds, 2)} | {k: v for k, v in result.items() if k != "validation"},
         **machine_facts(),
     }

@@ -73,13 +73,16 @@ class EvaluationReport:
     """Facts about the avatar's training."""
     search: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the correspondence search."""
+    refined_poses: Mapping[str, float] | None = None
+    """How much the poses of the frames were changed to fit their meshes, see `RefinedPoses.summary`; None for given poses."""
     samples: Mapping[str, Any] = field(default_factory=dict)
     """Settings with which the samples were made."""
 
     @property
     def title(self) -> str:
-        """System, subject, data set and split."""
-        return f"{self.model} of subject {self.subject}, data {self.data}, {SPLITS[self.split]} ({self.split})"
+        """System, subject, data set and split, and whether the poses were fitted to the meshes."""
+        title = f"{self.model} of subject {self.subject}, data {self.data}, {SPLITS[self.split]} ({self.split})"
+        return title if self.refined_poses is None else f"{title}, poses fitted to the meshes"
 
 
 def table(evaluation: EvaluationReport) -> str:
@@ -168,6 +171,7 @@ def metrics_content(evaluation: EvaluationReport, settings: Mapping[str, Any]) -
         **evaluation.machine,
         "training": dict(evaluation.training),
         "search": dict(evaluation.search),
+        "refined_poses": evaluation.refined_poses,
         "samples": dict(evaluation.samples),
         "seed": settings.get("seed"),
         "settings": dict(settings),

@@ -15,6 +15,7 @@ from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, Forward
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.weights import VoxelWeights
 from snarfcli.models.extent import bone_segments, weight_segments
+from snarfcli.models.pieces import floating_cells
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
 from snarfcli.shape import OccupancyNetwork
@@ -27,6 +28,7 @@ _GROWTH_M = 0.06  # margin of the cells searched in training around what might b
 _GROWTH_LOGIT = -3.0  # logit that counts as "might be occupied" in training: 5 %
 _FINAL_M = 0.04
 _FINAL_LOGIT = -2.0  # the same after training, for poses that were not sampled: 12 %
+_SURE_LOGIT = 1.0  # from here on a label is taken from the shape itself: 73 %
 _SURFACE_MOVES_M = 0.06  # largest displacement of the canonical surface by the pose
 
 
@@ -95,7 +97,7 @@ class FastSnarf(System):
     def node_weights(self) -> NodeWeights | None:
         return self.deformer.node_weights()
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
+    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> FoundRoots:
         weights = self.node_weights() if weights is None else weights
         return FoundRoots(self.deformer(points, bone_transforms, weights=weights), weights)
 
@@ -181,7 +183,7 @@ class FastSnarf(System):
         touched = torch.zeros(shape, dtype=torch.bool, device=places.device)
         for condition in self.condition(pose):
             seen = self._weights_seen(places[left], weights)
-            values = self.canonical_logits(places[left], condition[None], torch.zeros_like(left), precision, seen)
+            values = self._logits_in(condition, places[left], seen, precision)
             touched.view(-1)[left[values > threshold]] = True
             left = left[values <= threshold]
         return touched[None, None].float(), finer
@@ -216,6 +218,29 @@ class FastSnarf(System):
         if self._kept_cells is not None and bool(cells.any()):
             self.deformer.set_active_cells(cells)
 
+    @torch.no_grad()
+    def drop_pieces(self, pose: Tensor, inside: list[tuple[FoundRoots, Tensor]], precision: str = "highest") -> int:
+        """Stop searching cells that hold nothing but pieces which do not belong to the subject (see `floating_cells`)."""
+        if self.search.name != "complete":
+            return 0
+        samples, finer = self._occupied_samples(pose, 0.0, precision)
+        lower, upper = self.deformer.lower, self.deformer.upper
+        places, query, first = [lower.new_empty(0, 3)], [torch.empty(0, dtype=torch.long, device=lower.device)], 0
+        for found, posed in inside:
+            roots = found.roots
+            weights = self._weights_seen(roots.canonical, found.weights)
+            logits = self.canonical_logits(roots.canonical, self.condition(posed), roots.pose, precision, weights)
+            places.append(roots.canonical[logits > 0])
+            query.append(first + roots.query[logits > 0])
+            first += roots.batch * roots.count
+        steps = lower.new_tensor([n - 1 for n in samples.shape[:1:-1]]) / (upper - lower)
+        lattice = (torch.cat(places) - lower) * steps
+        cells, dropped = floating_cells(samples[0, 0] > 0, finer, lattice, torch.cat(query), self.config.model.components)
+        left = self.deformer.active_cells & ~cells
+        if dropped and bool(left.any()):
+            self.deformer.set_active_cells(left)
+        return dropped
+
     # ---------------------------------------------------------------- training
     def bone_logits(
         self,
@@ -246,6 +271,38 @@ class FastSnarf(System):
         if smoothness <= 0:
             return {}
         return {"smoothness": smoothness * self.deformer.smoothness(None if found is None else found.weights)}
+
+    def agreement_loss(
+        self,
+        pose: Tensor,
+        made_up: Tensor,
+        count: int,
+        generator: torch.Generator,
+        precision: str = "highest",
+        found: FoundRoots | None = None,
+    ) -> Tensor | None:
+        """Return the cross-entropy at random canonical points in made-up poses, with labels from the training poses.
+
+        A point is labelled where the shape says clearly, and equally in all training poses, whether it is occupied. Without
+        this a shape that depends on the pose may put pieces far from the body in poses unlike the training poses.
+        """
+        if not self.shape.conditioned:
+            return None
+        canonical = self.deformer.random_canonical(count, generator)
+        weights = self._weights_seen(canonical, None if found is None else found.weights)
+        with torch.no_grad():
+            known = torch.stack([self._logits_in(one, canonical, weights, precision) for one in self.condition(pose)])
+            inside = known.amin(0) > _SURE_LOGIT
+            sure = (inside | (known.amax(0) < -_SURE_LOGIT)).nonzero()[:, 0]
+        index = torch.randint(len(made_up), (len(sure),), generator=generator).to(sure.device)
+        seen = None if weights is None else weights[sure]
+        logits = self.canonical_logits(canonical[sure], self.condition(made_up), index, precision, seen)
+        return F.binary_cross_entropy_with_logits(logits, inside[sure].to(logits), reduction="sum") / count
+
+    def _logits_in(self, condition: Tensor, canonical: Tensor, weights: Tensor | None, precision: str) -> Tensor:
+        """Return the logits [M] of canonical points [M, 3] under one condition [C]."""
+        one = torch.zeros(len(canonical), dtype=torch.long, device=canonical.device)
+        return self.canonical_logits(canonical, condition[None], one, precision, weights)
 
     @torch.no_grad()
     def far_points(

@@ -229,6 +229,27 @@ class System(nn.Module):
         """
         return {}
 
+    def agreement_loss(
+        self,
+        pose: Tensor,
+        made_up: Tensor,
+        count: int,
+        generator: torch.Generator,
+        precision: str = "highest",
+        found: Found | None = None,
+    ) -> Tensor | None:
+        """Return a loss that keeps the canonical shape in made-up poses where training poses agree; None if not known.
+
+        Args:
+            pose: [B, J, 3], of training frames.
+            made_up: [P, J, 3].
+            count: number of canonical points.
+            generator: of random numbers.
+            precision: of the network.
+            found: from `find` with the same parameters; what it has evaluated is then not evaluated again.
+        """
+        return None
+
     def far_points(
         self, count: int, bone_transforms: Tensor, generator: torch.Generator, weights: NodeWeights | None = None
     ) -> Tensor | None:
@@ -252,6 +273,16 @@ class System(nn.Module):
 
     def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Shrink the active cells to the final shape in poses [P, J, 3]."""
+
+    def drop_pieces(self, pose: Tensor, inside: list[tuple[Found, Tensor]], precision: str = "highest") -> int:
+        """Drop pieces of the final shape in poses [P, J, 3] that do not belong to the subject; return their number.
+
+        Args:
+            pose: [P, J, 3].
+            inside: what `find` returned for points inside the training meshes, and the poses [B, J, 3] there.
+            precision: of the network.
+        """
+        return 0
 
     def freeze(self) -> None:
         """Prepare for use after training: compute what does not depend on the pose."""

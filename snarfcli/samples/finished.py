@@ -11,10 +11,10 @@ import numpy as np
 
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
-from snarfcli.files import read_json, read_npz
+from snarfcli.files import read_json, read_npz, write_arrays
 from snarfcli.samples.frames import frame_arrays, frame_numbers
 from snarfcli.samples.layout import SEQUENCE_FILES
-from snarfcli.samples.writing import settings_digest, write_arrays
+from snarfcli.samples.writing import settings_digest
 from snarfcli.sampling import check_mesh
 
 __all__ = ["complete_sequences", "write_subject"]

@@ -15,7 +15,7 @@ from snarfcli.datasets.splits import Split
 from snarfcli.samples.layout import check_digest, check_sizes, open_array, read_arrays
 from snarfcli.sampling.cube import dequantise, unpack_vertices
 
-__all__ = ["SequenceSamples"]
+__all__ = ["Frame", "SequenceSamples"]
 
 _VALIDATION_SHARE = 0.1
 
@@ -137,6 +137,10 @@ class SequenceSamples:
         """
         for name, entry in self.description["files"].items():
             check_digest(self.folder / name, entry["sha256"])
+
+
+Frame = tuple[SequenceSamples, int]
+"""A sequence and the index of one of its frames."""
 
 
 def _rows(frames: int | np.ndarray, index: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

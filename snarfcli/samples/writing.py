@@ -16,7 +16,7 @@ import numpy as np
 
 from snarfcli.datasets.splits import SPLITS
 from snarfcli.errors import UserError
-from snarfcli.files import atomic_path, file_digest, read_json, write_json
+from snarfcli.files import file_digest, read_json, write_arrays, write_json
 from snarfcli.locks import try_lock
 from snarfcli.samples.layout import FORMAT_VERSION, SEQUENCE_FILES, check_format
 from snarfcli.sampling.points import FrameSamples
@@ -29,7 +29,6 @@ __all__ = [
     "remove_leftovers",
     "require_same_settings",
     "settings_digest",
-    "write_arrays",
     "write_manifest",
 ]
 
@@ -45,12 +44,6 @@ def settings_digest(settings: Mapping[str, Any]) -> str:
 def describe_files(folder: Path, names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return the entries of a manifest for files: size and SHA-256."""
     return {name: {"bytes": (folder / name).stat().st_size, "sha256": file_digest(folder / name)} for name in names}
-
-
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write an `.npz` archive atomically."""
-    with atomic_path(path) as temporary:
-        np.savez(temporary, **arrays)  # pyright: ignore[reportArgumentType]  # stub: takes arrays for allow_pickle
 
 
 class SequenceWriter:

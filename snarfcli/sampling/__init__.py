@@ -21,7 +21,7 @@ from snarfcli.sampling.points import (
     sample_frame,
     sample_frames,
 )
-from snarfcli.sampling.surface import surface_samples, uniform_surface_samples
+from snarfcli.sampling.surface import oriented_surface_samples, surface_samples, uniform_surface_samples
 
 __all__ = [
     "CUBE_PADDING",
@@ -38,6 +38,7 @@ __all__ = [
     "in_turned_over",
     "labels_differ",
     "occupancies",
+    "oriented_surface_samples",
     "outline_samples",
     "pack_vertices",
     "quantise",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from snarfcli.errors import UserError
 from snarfcli.parallel import count_cores
+from snarfcli.samples.sequence import Frame, SequenceSamples
 from snarfcli.samples.store import SampleStore
 from snarfcli.training.fresh import DrawnPoints, FreshPoints, draw_steps
 from snarfcli.training.prefetch import Prefetch
@@ -32,6 +33,8 @@ class Batch:
     """[B, J, 4, 4], canonical to posed, metres."""
     pose: Tensor
     """[B, J, 3] axis-angle, radians."""
+    frames: list[Frame]
+    """B pairs of a sequence and the index of a frame."""
     cube: Tensor
     """[B, 2, 3], lower and upper corner of the cube that holds the points of a frame, metres; outside, nothing is occupied."""
 
@@ -67,9 +70,14 @@ class FrameBatches:
             picks.append((sequence, self.frames[index][1], np.concatenate([uniform, surface])))
         return load_frames(picks, self.device)
 
-    def poses(self, count: int, random: np.random.Generator | None = None) -> Tensor:
+    def with_poses(self, batch: Batch) -> Batch:
+        """Return a batch with the present poses of its frames, which may have been refined."""
+        transforms, pose = (torch.as_tensor(v, dtype=torch.float32, device=self.device) for v in _poses_of(batch.frames))
+        return replace(batch, bone_transforms=transforms, pose=pose)
+
+    def poses(self, count: int | None = None, random: np.random.Generator | None = None) -> Tensor:
         """Return the poses [P, J, 3] of at most `count` training frames: random ones, or evenly spaced without `random`."""
-        count = min(count, len(self.frames))
+        count = len(self.frames) if count is None else min(count, len(self.frames))
         if random is None:
             chosen = np.linspace(0, len(self.frames) - 1, count).round().astype(int)
         else:
@@ -121,22 +129,28 @@ def new_batches(store: SampleStore, config: TrainingConfig, seed: int, device: t
     return (FreshBatches if config.fresh_points else FrameBatches)(store, config, seed, device)
 
 
-def load_frames(picks: list, device: torch.device) -> Batch:
+def load_frames(picks: list[tuple[SequenceSamples, int, np.ndarray]], device: torch.device) -> Batch:
     """Return one batch of frames, given as tuples (sequence, frame, point indices)."""
     points = np.stack([sequence.points(frame, index) for sequence, frame, index in picks])
     occupied = np.stack([sequence.occupancies(frame, index) for sequence, frame, index in picks])
     return _gather([(sequence, frame) for sequence, frame, _ in picks], points, occupied, device)
 
 
-def _gather(frames: list, points: np.ndarray, occupied: np.ndarray, device: torch.device) -> Batch:
+def _gather(frames: list[Frame], points: np.ndarray, occupied: np.ndarray, device: torch.device) -> Batch:
     """Return one batch of points [B, N, 3] and labels [B, N] with the poses of their frames, tuples (sequence, frame)."""
-    transforms = np.stack([sequence.bone_transforms[frame] for sequence, frame in frames])
-    pose = np.stack([sequence.poses[frame] for sequence, frame in frames])
+    transforms, pose = _poses_of(frames)
     cube = np.stack([sequence.cube(frame) for sequence, frame in frames])
     return Batch(
         torch.as_tensor(points, dtype=torch.float32, device=device),
         torch.as_tensor(occupied, dtype=torch.bool, device=device),
         torch.as_tensor(transforms, dtype=torch.float32, device=device),
         torch.as_tensor(pose, dtype=torch.float32, device=device),
+        list(frames),
         torch.as_tensor(cube, dtype=torch.float32, device=device),
     )
+
+
+def _poses_of(frames: list[Frame]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bone transforms [B, J, 4, 4] and the poses [B, J, 3] of frames."""
+    transforms = np.stack([sequence.bone_transforms[frame] for sequence, frame in frames])
+    return transforms, np.stack([sequence.poses[frame] for sequence, frame in frames])

@@ -23,6 +23,12 @@ class TrainingConfig:
     """Number of points per frame from the near-surface half of its samples."""
     far_points: int = MISSING
     """Number of points per frame drawn in the canonical cells; if posed outside the sampling cube, they count as outside."""
+    agreement_weight: float = MISSING
+    """Weight of the loss that keeps the canonical shape in made-up poses like that in training poses, where these agree."""
+    agreement_points: int = MISSING
+    """Number of canonical points for that loss."""
+    agreement_every: int = MISSING
+    """Steps from one with that loss to the next."""
     fresh_points: bool = MISSING
     """Whether every step draws and labels new points from the stored meshes, instead of choosing among the stored points."""
     workers: int | None = MISSING
@@ -52,6 +58,8 @@ class TrainingConfig:
     extend_weights_every: int = MISSING
     """Steps between two replacements of the skinning weights at nodes away from the surface by harmonic ones; 0 never. Only for
     skinning=voxel."""
+    refine_poses: bool = MISSING
+    """Whether to correct the joint angles and the place of every frame while training, for poses that are only nearly right."""
     precision: str = MISSING
     """Arithmetic of the shape network: highest, high, medium or bfloat16; the search is always in full float32."""
     validate_every: int = MISSING

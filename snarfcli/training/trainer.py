@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
 from dataclasses import asdict, replace
 from functools import partial, reduce
@@ -16,21 +17,31 @@ from torch.nn import functional as F
 from snarfcli.deformer import NodeWeights
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import iou
+from snarfcli.fitting import PoseRefiner
 from snarfcli.models.extent import bone_owners, bone_segments
+from snarfcli.models.fast_snarf import FastSnarf
 from snarfcli.models.system import Found
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.precision import PRECISIONS, matmul_precision
 from snarfcli.samples.store import SampleStore
 from snarfcli.training.batches import Batch, load_frames, new_batches
 from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
+from snarfcli.training.made_up_poses import MadeUpPoses
 from snarfcli.training.optimizer import AveragedAdam
 from snarfcli.training.settings import TrainingConfig
 
 __all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Diverged", "Trainer"]
 
+log = logging.getLogger(__name__)
+
 CHECKPOINT_FORMAT = "snarf-checkpoint"
 CHECKPOINT_VERSION = 1
 
+_MADE_UP_POSES = 16  # per step with the loss for them
+_STEPS_OF_SUPPORT = 12  # whose inside points show which pieces of the shape belong to the subject
+_REFINE_FROM = 100  # step; before, the shape may lack whole limbs
+_NP = int(__import__("os").environ.get("NP", "2"))
+_RENEW_POINTS_EVERY = 100  # steps between two updates of the surface that refined poses are matched with
 _POSES_OF_A_REFRESH = 4  # number of training poses from which the searched cells are updated
 _POSES_AT_THE_END = 24  # the same for the finished avatar
 
@@ -61,6 +72,8 @@ class Trainer:
     ) -> None:
         if config.precision not in PRECISIONS:
             raise ValueError(f"training.precision: wanted one of {', '.join(PRECISIONS)}, got {config.precision!r}")
+        if config.refine_poses:
+            store = SampleStore(store.folder, store.manifest)  # whose poses may change
         self.avatar, self.store, self.config, self.seed, self.device = avatar, store, config, seed, device
         self.model = avatar.model.to(device)
         self.model.train()
@@ -69,6 +82,8 @@ class Trainer:
         self.bone_owners = torch.tensor(bone_owners(avatar.skeleton), device=device)
         self.joints = avatar.skeleton.canonical_joints.to(device)
         self.joint_targets = joint_weight_targets(avatar.skeleton.parents, config.joint_target).to(device)
+        self.refiner = self._new_refiner() if config.refine_poses else None
+        self.made_up = MadeUpPoses(self.batches.poses())
         self.optimizer = AveragedAdam(self.model, config)
         self.step = 0
 
@@ -80,6 +95,8 @@ class Trainer:
         """
         self._maintain_grids()
         batch = self.batches.batch(self.step)
+        if self.refiner is not None and self.step >= _REFINE_FROM:
+            batch = self._with_refined_poses(batch)
         weights = self.model.node_weights()
         if self.config.far_points:
             batch = self._with_far_points(batch, weights)
@@ -88,6 +105,8 @@ class Trainer:
         losses = {"occupancy": occupancy_loss(field.logits, batch.occupied, field.found)}
         if self.step < self.config.bootstrap_steps:
             losses |= self._bootstrap_losses(batch, found)
+        if self.config.agreement_weight > 0 and self._is_due(self.config.agreement_every):
+            losses |= self._agreement_loss(batch, found)
         losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._generator(5), self.config.precision, found)
         total = reduce(torch.add, losses.values())
         self._check_finite("loss", total.item())
@@ -101,6 +120,30 @@ class Trainer:
         numbers |= {"total": total.item(), "inside_without_correspondence": lost.item()}
         numbers |= {"correspondences_per_point": field.correspondences / max(batch.occupied.numel(), 1)}
         return numbers
+
+    def _new_refiner(self) -> PoseRefiner:
+        """Return what refines the poses of all training sequences; with their held-back frames, which no step sees.
+
+        Raises:
+            ValueError: the system has no forward skinning, or the samples are planar.
+        """
+        if self.store.manifest["settings"].get("is_planar", False):
+            raise ValueError("training.refine_poses: wanted samples of surfaces in space, got planar ones; leave it out")
+        if not isinstance(self.model, FastSnarf):
+            name = self.avatar.config.model.name
+            raise ValueError(
+                f"training.refine_poses: wanted model=fast_snarf or snarf, got {name}, which has no forward skinning"
+            )
+        return PoseRefiner(self.store.sequences("train"), self.avatar.skeleton, self.device, self.seed)
+
+    def _with_refined_poses(self, batch: Batch) -> Batch:
+        """Refine the poses of the frames of a batch, and return the batch with these poses."""
+        assert self.refiner is not None
+        assert isinstance(self.model, FastSnarf)
+        if self._is_due(_RENEW_POINTS_EVERY) or self.step == _REFINE_FROM:
+            self.refiner.renew_points(self.avatar)
+        self.refiner.refine(self.model, batch.frames, self.step, self.config.precision)
+        return self.batches.with_poses(batch)
 
     def _maintain_grids(self) -> None:
         """Let the grids follow the shape, in the steps in which this is due."""
@@ -127,8 +170,11 @@ class Trainer:
 
     def _generator(self, purpose: int) -> torch.Generator:
         """Return the random generator for one purpose in the coming step."""
-        seed = int(np.random.default_rng([self.seed, self.step, purpose]).integers(2**62))
-        return torch.Generator().manual_seed(seed)
+        return torch.Generator().manual_seed(self._seed(purpose))
+
+    def _seed(self, purpose: int) -> int:
+        """Return the seed for one purpose in the coming step."""
+        return int(np.random.default_rng([self.seed, self.step, purpose]).integers(2**62))
 
     @torch.no_grad()
     def _with_far_points(self, batch: Batch, weights: NodeWeights | None) -> Batch:
@@ -169,6 +215,13 @@ class Trainer:
                 losses["joint_weight"] = config.joint_weight * F.mse_loss(weights, self.joint_targets.expand_as(weights))
         return losses
 
+    def _agreement_loss(self, batch: Batch, found: Found) -> dict[str, Tensor]:
+        """Return the loss that keeps the shape in poses that no frame shows."""
+        generator, config = self._generator(6), self.config
+        made_up = self.made_up.draw(_MADE_UP_POSES, generator)
+        loss = self.model.agreement_loss(batch.pose, made_up, config.agreement_points, generator, config.precision, found)
+        return {} if loss is None else {"agreement": config.agreement_weight * loss}
+
     def averaged_avatar(self) -> TrainedField:
         """Return a copy of the avatar with the averaged weights, ready to use."""
         avatar = self.avatar.with_model(copy.deepcopy(self.model))
@@ -179,10 +232,25 @@ class Trainer:
         return avatar.to(self.device)
 
     def finished_avatar(self) -> TrainedField:
-        """Return the averaged avatar, its searched cells shrunk to its shape in training poses."""
+        """Return the averaged avatar, its searched cells shrunk to its shape in training poses, without floating pieces."""
         avatar = self.averaged_avatar()
-        avatar.model.tighten_cells(self.batches.poses(_POSES_AT_THE_END), self.config.precision)
+        poses = self.batches.poses(_POSES_AT_THE_END)
+        avatar.model.tighten_cells(poses, self.config.precision)
+        dropped = avatar.model.drop_pieces(poses, [self._found_inside(avatar, step) for step in range(_STEPS_OF_SUPPORT)])
+        if dropped:
+            what = "a piece" if dropped == 1 else f"{dropped} pieces"
+            log.info("dropped %s of the shape that no training mesh needs (model.components=N keeps the N largest)", what)
+        if self.refiner is not None:
+            avatar.model.freeze()
+            self.refiner.finish(avatar)
         return avatar
+
+    def _found_inside(self, avatar: TrainedField, step: int) -> tuple[Found, Tensor]:
+        """Return where the points of a step's batch that are inside the meshes come from, and the poses [B, J, 3] there."""
+        batch = self.batches.batch(step)
+        nowhere = batch.cube[:, None, 1] + 10 * (batch.cube[:, None, 1] - batch.cube[:, None, 0])  # beyond all cells
+        points = torch.where(batch.occupied[..., None], batch.points, nowhere)
+        return avatar.find(points, batch.bone_transforms, batch.pose), batch.pose
 
     @torch.no_grad()
     def validate(self) -> dict[str, float]:
@@ -190,9 +258,11 @@ class Trainer:
         avatar = self.averaged_avatar()
         frames = [(sequence, int(f)) for sequence in self.store.sequences("train") for f in sequence.val_frames]
         count = min(self.config.validation_frames, len(frames))
+        frames = [frames[index] for index in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+        if self.refiner is not None:
+            self.refiner.refine_all(avatar, frames, desc="validate: refine poses")
         values = []
-        for index in np.linspace(0, len(frames) - 1, count).round().astype(int):
-            sequence, frame = frames[index]
+        for sequence, frame in frames:
             batch = load_frames([(sequence, frame, np.arange(0, sequence.num_points, 2))], self.device)
             inside = avatar.query(batch.points, batch.bone_transforms, batch.pose).logits > 0
             inside, occupied = inside[0].cpu().numpy(), batch.occupied[0].cpu().numpy()
@@ -214,6 +284,7 @@ class Trainer:
             "avatar": self.avatar.to_dict(),
             "training": asdict(self.config),
             "random": torch.get_rng_state(),
+            "poses": None if self.refiner is None else self.refiner.state(),
         } | self.optimizer.state()
 
     def restore(self, state: dict[str, Any], path: str) -> None:
@@ -237,6 +308,8 @@ class Trainer:
         try:
             self.model.load_state_dict(state["avatar"]["state"])
             self.optimizer.restore(state)
+            if self.refiner is not None:
+                self.refiner.restore(state["poses"])
             torch.set_rng_state(state["random"])
             self.step = int(state["step"])
         except (KeyError, RuntimeError, TypeError, ValueError) as error:

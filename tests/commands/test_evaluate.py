@@ -52,6 +52,7 @@ def config(store: SampleStore, tmp_path: Path, caplog: pytest.LogCaptureFixture)
         max_frames=None,
         points=None,
         figure=False,
+        refine_poses=False,
         surface_frames=0,
         surface_resolution=32,
         figure_frames=1,

@@ -60,7 +60,7 @@ def eval_config(config: TrainConfig, search: SearchConfig | None = None) -> Eval
     return EvalConfig(
         subject="toy", data=config.data, search=search, data_root=config.data_root, output_root=config.output_root,
         run=config.run, split="id", ckpt=None, max_frames=2, points=None, figure=False, figure_frames=1,
-        surface_frames=0, surface_resolution=32, figure_resolution=24, device="cpu", threads=None, seed=0,
+        refine_poses=False, surface_frames=0, surface_resolution=32, figure_resolution=24, device="cpu", threads=None, seed=0,
     )  # fmt: skip
 
 

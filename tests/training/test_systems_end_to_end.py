@@ -55,7 +55,7 @@ def config_for(store, tmp_path):
 def eval_config(config: TrainConfig, **changes) -> EvalConfig:
     settings = EvalConfig(
         subject="toy", data=config.data, search=None, data_root=config.data_root, output_root=config.output_root,
-        run=config.run, split="ood", ckpt=None, max_frames=2, points=None, figure=True, figure_frames=1,
+        run=config.run, split="ood", ckpt=None, max_frames=2, points=None, figure=True, figure_frames=1, refine_poses=False,
         surface_frames=1, surface_resolution=24, figure_resolution=24, device="cpu", threads=None, seed=0,
     )  # fmt: skip
     return replace(settings, **changes)

@@ -1,0 +1,18 @@
+"""Fitting the poses of an avatar to surfaces that are seen."""
+
+from snarfcli.fitting.corrections import Corrections, Corrector
+from snarfcli.fitting.pose_fit import CanonicalPoints, FittedPoses, PoseFit, Surfaces
+from snarfcli.fitting.refined_poses import RefinedPoses, refined_poses_text
+from snarfcli.fitting.refiner import PoseRefiner
+
+__all__ = [
+    "CanonicalPoints",
+    "Corrections",
+    "Corrector",
+    "FittedPoses",
+    "PoseFit",
+    "PoseRefiner",
+    "RefinedPoses",
+    "Surfaces",
+    "refined_poses_text",
+]

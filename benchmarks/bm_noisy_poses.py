@@ -5,6 +5,12 @@
 Copies processed built-in samples from one data_root to another. Points, labels and meshes stay; poses, translations, bone
 transforms and joints are those of the noisy poses. The true poses are kept in `true_poses.npz` in the folder of each subject.
 
+    snarf train subject=50002 training=quick training.refine_poses=true data_root=noisy/data run=refined
+    snarf eval subject=50002 refine_poses=true data_root=noisy/data run=refined
+    python benchmarks/bm_noisy_poses.py data noisy/data --refined outputs/builtin/50002/refined/refined_poses.npz
+
+The last command compares the refined poses with the true ones instead of writing samples.
+
 Noise, independent per frame: the local rotation of every joint, the root included, is followed (in the axes of the rotated
 joint) by a rotation whose vector has three normal components, with a standard deviation for which the mean angle is `--degrees`
 (the rms angle is 1.085 times as large); the translation is shifted by a normal vector whose rms length is `--shift`.
@@ -27,10 +33,10 @@ from torch import Tensor
 from snarfcli.bodies import Skeleton, axis_angle_to_matrix, invert_rigid, matrix_to_axis_angle
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.datasets.splits import SPLITS
-from snarfcli.files import read_json, read_npz, write_json
+from snarfcli.files import read_json, read_npz, write_arrays, write_json
 from snarfcli.samples.layout import read_arrays, samples_folder
 from snarfcli.samples.store import SampleStore
-from snarfcli.samples.writing import describe_files, write_arrays
+from snarfcli.samples.writing import describe_files
 
 __all__ = ["PoseErrors", "add_noise", "pose_errors", "read_true_poses", "write_noisy_samples"]
 
@@ -197,8 +203,17 @@ def _stored_errors(root: Path, data: str, subject: str, split: str) -> PoseError
     return pose_errors(store.skeleton, together[0], together[1])
 
 
+def _refined_errors(root: Path, data: str, subject: str, refined: Path) -> PoseErrors:
+    """Return the errors of the poses that a training run has refined, over all training frames."""
+    store = SampleStore.open(root, data, subject)
+    arrays = read_npz(refined, "file of refined poses", only=["poses", "trans"])
+    found = torch.from_numpy(arrays["poses"]), torch.from_numpy(arrays["trans"])
+    true = [read_true_poses(root, data, subject, "train", entry.name) for entry in store.sequences("train")]
+    return pose_errors(store.skeleton, found, (torch.cat([p for p, _ in true]), torch.cat([t for _, t in true])))
+
+
 def main() -> None:
-    """Write noisy samples, check their files, and print how wrong their poses are."""
+    """Write noisy samples, check their files, and print how wrong their poses are; or compare refined poses with true ones."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path, help="data_root with the processed samples")
     parser.add_argument("target", type=Path, help="data_root of the noisy copy")
@@ -210,8 +225,13 @@ def main() -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the noise (default: 0)")
     parser.add_argument("--splits", nargs="+", choices=SPLITS, default=list(SPLITS), help="splits with noise (default: all)")
+    parser.add_argument("--refined", type=Path, help="refined_poses.npz of a run on the noisy samples of the first subject")
     options = parser.parse_args()
     rows = []
+    if options.refined is not None:
+        errors = _refined_errors(options.target, options.data, options.subjects[0], options.refined)
+        rows.append([options.subjects[0], "train, refined", *errors.row()])
+        options.subjects = []
     for subject in options.subjects:
         place = samples_folder(options.source, options.data, subject) / "manifest.json"
         require(place, f"snarf preprocess data={options.data} subject={subject} data_root={options.source}")

@@ -51,6 +51,8 @@ def check_skinning(skinning: SkinningConfig, search: SearchConfig) -> None:
         check_positive(f"skinning.{name}", getattr(skinning, name))
     if skinning.smoothness and skinning.name != "voxel":
         raise UserError("skinning.smoothness is for skinning=voxel; the other fields are smooth without it")
+    if skinning.symmetric and skinning.name != "voxel":
+        raise UserError("skinning.symmetric is for skinning=voxel; leave it out")
     if skinning.weights_file is not None and skinning.name != "preset":
         raise UserError("skinning.weights_file is for skinning=preset; the other fields are learned")
     if skinning.name == "preset" and skinning.weights_file is None:

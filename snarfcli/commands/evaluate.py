@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -24,12 +23,10 @@ from snarfcli.evaluation.report import SPLITS, STORE_SPLITS, EvaluationReport, m
 from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
 from snarfcli.files import write_json
-from snarfcli.fitting import PoseRefiner, refined_poses_text
-from snarfcli.models.fast_snarf import FastSnarf
+from snarfcli.fitting import PoseRefiner, refined_poses_text, require_refinable
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
-from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.samples.store import SampleStore
 
 __all__ = ["EvalConfig", "run"]
@@ -113,7 +110,7 @@ def run(config: EvalConfig) -> None:
     )  # fmt: skip
     log.info("avatar: %s, %s, on %s", path, f"search {search.name}" if search else avatar.config.model.name, device)
 
-    refined = _refine(config, avatar, sequences) if config.refine_poses else None
+    refined = _refine(config, avatar, store) if config.refine_poses else None
     start = time.perf_counter()
     frames = evaluate(
         avatar,
@@ -178,15 +175,17 @@ def _check(config: EvalConfig) -> None:
         builtin_subject(config.subject)  # raises for an unknown subject, with the most similar name
 
 
-def _refine(config: EvalConfig, avatar: Avatar, sequences: Sequence[SequenceSamples]) -> dict[str, float]:
+def _refine(config: EvalConfig, avatar: Avatar, store: SampleStore) -> dict[str, float]:
     """Fit the poses of all frames that are measured to their meshes; return how much they changed.
 
     Raises:
-        UserError: the avatar's system has no forward skinning.
+        UserError: the poses of these samples cannot be refined with this avatar.
     """
-    if not isinstance(avatar.model, FastSnarf):
-        name = avatar.config.model.name
-        raise UserError(f"refine_poses: wanted an avatar of model fast_snarf or snarf, got {name}; leave refine_poses out")
+    try:
+        require_refinable(avatar, store, "refine_poses")
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    sequences = store.sequences(STORE_SPLITS[config.split])
     refiner = PoseRefiner(sequences, avatar.skeleton, avatar.device, config.seed)
     frames = choose_frames(sequences, config.max_frames)
     if config.surface_frames:

@@ -28,6 +28,7 @@ from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.start_bones import with_start_bones
+from snarfcli.models.symmetry import find_mirror
 from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
@@ -44,13 +45,15 @@ __all__ = ["TrainConfig", "new_trainer", "run"]
 
 log = logging.getLogger(__name__)
 
-_AT_LEAST_ONE = ("steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every", "agreement_every")
+_AT_LEAST_ONE = (
+    "steps", "poses_per_step", "bone_points", "validate_every", "checkpoint_every", "agreement_every", "agreement_points",
+)  # fmt: skip
 _NOT_NEGATIVE = (
     "uniform_points", "surface_points", "far_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight",
     "joint_weight", "validation_frames", "refresh_cells_every", "extend_weights_every", "workers",
-    "agreement_weight", "agreement_points",
+    "agreement_weight",
 )  # fmt: skip
-_LEAST_OF_PARTS = {"part_width": 1, "part_depth": 1, "part_code": 0, "part_weight": 0, "part_points": 1}
+_LEAST_OF_MODEL = {"part_width": 1, "part_depth": 1, "part_code": 0, "part_weight": 0, "part_points": 1, "components": 1}
 
 
 @dataclass
@@ -149,15 +152,17 @@ def run(config: TrainConfig) -> None:
             raise
     finished = trainer.finished_avatar()
     finished.facts |= {"steps": trainer.step, "validation": result["validation"]}
+    finished.save(folder / "avatar.pt")
     if trainer.refiner is not None:
+        trainer.refiner.finish(finished)
         trainer.refiner.poses.write(folder / "refined_poses.npz")
         _report_poses(trainer.refiner.poses, folder)
-    finished.save(folder / "avatar.pt")
     write_json(folder / "metrics.json", _metrics(config, result, trainer, time.time() - start))
     validation = result["validation"]
     if validation:
         log.info(
-            "validation (held-back motion): IoU bbox %.2f %%, surface %.2f %%",
+            "validation (held-back motion%s): IoU bbox %.2f %%, surface %.2f %%",
+            "" if trainer.refiner is None else ", poses fitted to the meshes",
             100 * validation["iou_bbox"],
             100 * validation["iou_surface"],
         )
@@ -206,7 +211,7 @@ def _check(config: TrainConfig) -> None:
         for name, size in (("condition.size", config.condition.size), ("shape.condition_size", config.shape.condition_size)):
             check_number(name, size, 1)
     check_choice("model.name", config.model.name, SYSTEMS)
-    for name, least in _LEAST_OF_PARTS.items():
+    for name, least in _LEAST_OF_MODEL.items():
         check_number(f"model.{name}", getattr(config.model, name), least)
     if config.model.name == "snarf" and config.search.name != "broyden":
         raise UserError(
@@ -226,8 +231,10 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
     template = _template(config.model.name, store)
     search = with_start_bones(config.search, store.skeleton)
     surface = rough_canonical_points(store)
-    skinning = with_grid_sides(config.skinning, surface, store.skeleton)
-    grid = CanonicalGrid.around(surface, skinning.margin_m)
+    mirror = find_mirror(store.skeleton) if config.skinning.symmetric else None
+    extent = surface if mirror is None else mirror.complete(surface)
+    skinning = with_grid_sides(config.skinning, extent, store.skeleton)
+    grid = CanonicalGrid.around(extent, skinning.margin_m)
     field = None
     if skinning.name == "preset":
         assert skinning.weights_file is not None  # see check_skinning

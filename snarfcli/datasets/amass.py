@@ -82,8 +82,10 @@ def load(subject: str, request: DataRequest) -> SubjectData:
         raise UserError(_first_reason(broken))
     sources = (*person.sources, f"motions: {len(files)} files in {place}")
     if "test" not in splits.values():
+        count = len(sequences)
         sequences = _hold_back_ends(sequences, person)
-        sources += (f"fewer than {_FEWEST_SEQUENCES} sequences in distribution: the last fifth of each is for testing",)
+        if len(sequences) > count:
+            sources += (f"fewer than {_FEWEST_SEQUENCES} sequences in distribution: the last fifth of each is for testing",)
     sequences.sort(key=lambda spec: SPLITS.index(spec.split))
     template = body_template(person.body, person.betas, person.skeleton)
     return SubjectData(

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from snarfcli.bodies import Skeleton
-from snarfcli.datasets.pose_fit import measure_pose_fit
+from snarfcli.datasets.pose_consistency import measure_pose_consistency
 from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
@@ -29,9 +29,8 @@ _FRAMES_DRAWN = 4
 _VERTICES_MEASURED = 2000
 # Share of joints inside the mesh: nearly all for a person, most for a rigged animal, whose first joint may be on the ground.
 _JOINTS_INSIDE_BAD, _JOINTS_INSIDE_GOOD = 0.25, 0.6
-_FAR_FROM_BONES = (
-    0.25  # median distance of vertices to bones, as a share of the mesh's longest side, above which they do not fit
-)
+# Median distance of vertices to bones, as a share of the mesh's longest side, above which they do not fit.
+_FAR_FROM_BONES = 0.25
 # How far the surface near a bone may move between frames, as a share of the mesh's longest side. Measured on 15 subjects
 # (built-in, clothed, stick, rigged): at most 0.1 % with correct poses, over 0.6 % with 2 degrees per joint and 1 cm of noise.
 _MOVED_AT_BONES = 0.004
@@ -198,7 +197,7 @@ def _about_fit(skeleton: Skeleton, seen: list[ExaminedFrame]) -> Remark:
 
 def _about_poses(skeleton: Skeleton, seen: list[ExaminedFrame]) -> Iterator[Remark]:
     """Yield whether the poses fit the meshes frame by frame."""
-    fit = measure_pose_fit(skeleton, seen)
+    fit = measure_pose_consistency(skeleton, seen)
     if fit is None:
         return
     moved, allowed = (f"{100 * length:.1f} cm" for length in (fit.moved_m, _MOVED_AT_BONES * fit.length_m))

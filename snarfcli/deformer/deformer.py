@@ -44,6 +44,7 @@ class ForwardDeformer(nn.Module):
         field: a custom weight field instead of the one that `skinning` describes: a module or function from canonical
             points [N, 3], metres, to weights [N, J], rows sum to 1. It is evaluated at the grid nodes, or searched directly if
             skinning.name is "mlp". A module is trained, moved and saved with the deformer.
+        mirror: the bone to which each is mapped by the symmetry of voxel weights, see `VoxelWeights`; None for none.
 
     Raises:
         ValueError: a setting does not exist, or does not fit the others.
@@ -69,6 +70,7 @@ class ForwardDeformer(nn.Module):
         *,
         parents: Sequence[int] | None = None,
         field: Callable[[Tensor], Tensor] | None = None,
+        mirror: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
         skinning = skinning or SkinningConfig()
@@ -80,7 +82,7 @@ class ForwardDeformer(nn.Module):
         self.searches_field = skinning.name == "mlp"
         """Whether roots are those of the field itself and not of its values at the grid nodes."""
         self.search = as_search_config(search or ("broyden" if self.searches_field else None))
-        self.field = field if field is not None else _make_field(grid, self.shape, num_bones, skinning, prior, parents)
+        self.field = field if field is not None else _make_field(grid, self.shape, num_bones, skinning, prior, parents, mirror)
         if isinstance(self.field, GridWeights) and self.field.shape != self.shape:
             raise ValueError(f"field: wanted the grid's nodes {list(self.shape)} (z, y, x), got {list(self.field.shape)}")
         self.register_buffer("lower", grid.lower.clone())
@@ -291,13 +293,14 @@ def _make_field(
     skinning: SkinningConfig,
     prior: BonePrior | None,
     parents: Sequence[int] | None,
+    mirror: Sequence[int] | None,
 ) -> WeightField:
     """Return the weight field of the settings."""
     if skinning.name == "preset":
         raise ValueError("field: wanted weights for skinning.name 'preset', got None; give PresetWeights.from_vertices(...)")
     softmax = make_softmax(skinning.softmax, num_bones, parents)
     if skinning.name == "voxel":
-        return VoxelWeights(softmax, grid, shape, skinning.sharpness, prior)
+        return VoxelWeights(softmax, grid, shape, skinning.sharpness, prior, mirror)
     return NetworkWeights(softmax, grid, skinning.width, skinning.depth, skinning.sharpness, skinning.weight_norm, prior)
 
 

@@ -37,5 +37,7 @@ class SkinningConfig:
     """Prior of the field: weights that fall by a factor e over this distance to a bone, metres; null for no prior."""
     smoothness: float = 0.0
     """Weight of the loss on differences of voxel weights between neighbouring nodes."""
+    symmetric: bool = False
+    """Whether voxel weights are the same on the left and on the right, if the skeleton is symmetric."""
     weights_file: str | None = None
     """Preset weights: .npz file with vertices [V, 3], canonical pose, metres, and weights [V, J]; kept in the avatar."""

@@ -201,6 +201,8 @@ class VoxelWeights(GridWeights):
         shape: nodes (D, H, W).
         sharpness: factor before the softmax, which makes steps of the optimiser as large as those of the distilled field.
         prior: logits of a plain softmax to start from; without it all weights are equal at first.
+        mirror: [J], the bone to which the plane through the middle of the box, across x, maps each. Weights at mirrored places
+            are then the same, for mirrored bones: the mean of those that are optimised on both sides. None for no symmetry.
     """
 
     def __init__(
@@ -210,8 +212,10 @@ class VoxelWeights(GridWeights):
         shape: tuple[int, int, int],
         sharpness: float,
         prior: BonePrior | None = None,
+        mirror: Sequence[int] | None = None,
     ) -> None:
         super().__init__(grid, shape)
+        self.mirror = None if mirror is None else list(mirror)
         self.softmax = softmax
         self.sharpness = sharpness
         nodes = grid.nodes(shape).reshape(-1, 3)
@@ -221,9 +225,22 @@ class VoxelWeights(GridWeights):
     def at_nodes(self, nodes: Tensor | None = None) -> Tensor:
         """Return the weights [..., J] at the nodes with flat indices [...], or of all nodes, [D * H * W, J]."""
         if nodes is None:
-            return self.softmax(self.sharpness * self.logits)
-        chosen = self.logits.index_select(0, nodes.reshape(-1))  # whose gradient is faster than that of an index
-        return self.softmax(self.sharpness * chosen).reshape(*nodes.shape, -1)
+            weights = self.softmax(self.sharpness * self.logits)
+            if self.mirror is None:
+                return weights
+            other = weights.reshape(*self.shape, -1).flip(2)[..., self.mirror]
+            return (weights + other.reshape(weights.shape)) / 2
+        weights = self._weights_of(nodes.reshape(-1))
+        if self.mirror is not None:
+            column = nodes.reshape(-1) % self.shape[2]
+            other = self._weights_of(nodes.reshape(-1) + self.shape[2] - 1 - 2 * column)
+            weights = (weights + other[:, self.mirror]) / 2
+        return weights.reshape(*nodes.shape, -1)
+
+    def _weights_of(self, nodes: Tensor) -> Tensor:
+        """Return the weights [K, J] that are optimised at nodes with flat indices [K]."""
+        chosen = self.logits.index_select(0, nodes)  # whose gradient is faster than that of an index
+        return self.softmax(self.sharpness * chosen)
 
     @torch.no_grad()
     def extend_from(self, nodes: Tensor) -> None:

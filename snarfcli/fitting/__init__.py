@@ -3,7 +3,7 @@
 from snarfcli.fitting.corrections import Corrections, Corrector
 from snarfcli.fitting.pose_fit import CanonicalPoints, FittedPoses, PoseFit, Surfaces
 from snarfcli.fitting.refined_poses import RefinedPoses, refined_poses_text
-from snarfcli.fitting.refiner import PoseRefiner
+from snarfcli.fitting.refiner import PoseRefiner, require_refinable
 
 __all__ = [
     "CanonicalPoints",
@@ -15,4 +15,5 @@ __all__ = [
     "RefinedPoses",
     "Surfaces",
     "refined_poses_text",
+    "require_refinable",
 ]

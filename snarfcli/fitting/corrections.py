@@ -87,11 +87,11 @@ class Corrector:
         change = axis_angle_to_matrix(corrections.turn)
         about_joint = turns @ change @ turns.transpose(-1, -2)  # the same rotation, in the axes of the posed frame
         fixed = centre - (about_joint @ centre[..., None])[..., 0]
-        one = torch.zeros_like(bone_transforms)
-        one[..., :3, :3], one[..., :3, 3], one[..., 3, 3] = about_joint, fixed, 1
-        one[:, [joint for joint, parent in enumerate(self.parents) if parent < 0], :3, 3] += corrections.shift[:, None]
+        own_moves = torch.zeros_like(bone_transforms)
+        own_moves[..., :3, :3], own_moves[..., :3, 3], own_moves[..., 3, 3] = about_joint, fixed, 1
+        own_moves[:, [joint for joint, parent in enumerate(self.parents) if parent < 0], :3, 3] += corrections.shift[:, None]
         moves: list[Tensor] = []  # of each bone, with all its ancestors
         for joint, parent in enumerate(self.parents):
-            moves.append(one[:, joint] if parent < 0 else moves[parent] @ one[:, joint])
+            moves.append(own_moves[:, joint] if parent < 0 else moves[parent] @ own_moves[:, joint])
         local = axis_angle_to_matrix(pose) @ self._axes.transpose(-1, -2) @ change @ self._axes
         return torch.stack(moves, 1) @ bone_transforms, matrix_to_axis_angle(local)

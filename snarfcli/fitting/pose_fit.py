@@ -243,8 +243,9 @@ def _closest(points: Tensor, normals: Tensor, seen: Surfaces, back: int = 0) -> 
         The index of the seen point closest to each point, [B, S]; that of the point closest to each of the first `back` seen
         points, [B, back].
     """
-    own = torch.cat([points, _NORMALS_M * normals], -1)
-    apart = torch.cdist(own, torch.cat([seen.points, _NORMALS_M * seen.normals], -1))
+    centre = seen.points.mean(1, keepdim=True)  # far from the origin distances would be inexact
+    own = torch.cat([points - centre, _NORMALS_M * normals], -1)
+    apart = torch.cdist(own, torch.cat([seen.points - centre, _NORMALS_M * seen.normals], -1))
     return apart.argmin(2), apart[..., :back].argmin(1) if back else apart.new_empty(len(apart), 0, dtype=torch.long)
 
 

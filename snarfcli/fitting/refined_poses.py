@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from snarfcli.bodies import Skeleton
+from snarfcli.errors import UserError
 from snarfcli.files import write_arrays
 from snarfcli.fitting.corrections import Corrections, Corrector, bone_turns
 from snarfcli.fitting.pose_fit import CanonicalPoints, FittedPoses, PoseFit, Surfaces
@@ -20,6 +21,7 @@ from snarfcli.sampling import oriented_surface_samples
 
 __all__ = ["RefinedPoses", "refined_poses_text"]
 
+_LEAST_MATCHED = 0.5  # share of the points on a mesh; with fewer the pose counts as not refined
 _NEAR = 0.005  # of the longest side of the subject's box: 9 mm for a person; closest points alone reach 6 mm
 _MISFIT = 0.006  # of the longest side of the subject's box: 1 cm for a person; refined poses reach a fifth of it
 _UNMATCHED_M = 1.0  # reported for a mesh without any match
@@ -55,9 +57,8 @@ class RefinedPoses:
         self.size_m = float(np.median(sizes))
         """Longest side of the subject's box in a frame, median over the frames, metres."""
         self._drawn: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
-        self._given = [
-            (s.poses.copy(), s.bone_transforms.copy(), s.translation.copy(), s.joints.copy()) for s in self.sequences
-        ]
+        self._given = [(s.poses.copy(), s.bone_transforms.copy(), s.translation.copy()) for s in self.sequences]
+        self._are_trained = torch.cat([torch.arange(s.num_frames) < len(s.train_frames) for s in self.sequences])
         self.corrections = Corrections.none(int(self._start[-1]), skeleton.num_joints, torch.zeros(0))
         """Of all F frames, the common part included."""
         self._in_effect = Corrections.none(int(self._start[-1]), skeleton.num_joints, torch.zeros(0))
@@ -92,17 +93,17 @@ class RefinedPoses:
         if fitted is not None:
             corrections = corrections.to(torch.device("cpu"))
             self.corrections.put(rows, corrections)
-            self.distance_m[rows] = fitted.distance.cpu()
+            self.distance_m[rows] = fitted.distance.where(fitted.matched > _LEAST_MATCHED, torch.inf).cpu()
             self._in_effect.put(rows, self._centred(corrections, rows) if centred else corrections)
             self._take_effect(frames, rows)
 
     def common_part(self) -> Corrections:
-        """Return the mean of all corrections made so far, the shift in the axes of the root.
+        """Return the mean of the corrections of training frames made so far, the shift in the axes of the root.
 
         The same turn of a bone in every frame, or the same shift in the axes of the root, can as well be a change of the
         canonical shape, so no frame determines it.
         """
-        done = (~self.distance_m.isnan()).nonzero()[:, 0]
+        done = (self._are_trained & self.distance_m.isfinite()).nonzero()[:, 0]
         if not len(done):
             return Corrections.none(1, self.skeleton.num_joints, self.corrections.turn)
         shift = (self._root_axes[done].transpose(1, 2) @ self.corrections.shift[done, :, None])[..., 0]
@@ -141,7 +142,10 @@ class RefinedPoses:
             return self._drawn[row]
         sequence, index = frame
         generator = np.random.default_rng([row, len(self.distance_m)])
-        points, normals = oriented_surface_samples(sequence.vertices(index), sequence.faces(index), _POINTS, generator)
+        try:
+            points, normals = oriented_surface_samples(sequence.vertices(index), sequence.faces(index), _POINTS, generator)
+        except UserError as error:
+            raise UserError(f"{sequence.name}, frame {sequence.frame_numbers[index]}: {error}") from None
         drawn = points.astype(np.float32), normals.astype(np.float32)
         if len(self._drawn) < _KEPT_FRAMES:
             self._drawn[row] = drawn

@@ -1,4 +1,4 @@
-"""When and with which steps poses are refined: while an avatar is trained, and with a finished one."""
+"""Schedule of pose refinement, during training and for a finished avatar."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from snarfcli.models.fast_snarf import FastSnarf
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
 from snarfcli.samples.sequence import Frame, SequenceSamples
+from snarfcli.samples.store import SampleStore
 
-__all__ = ["PoseRefiner"]
+__all__ = ["PoseRefiner", "require_refinable"]
 
 _RESOLUTION = 64  # of the canonical surface; voxels of 3 cm on a body
 _POINTS = 400  # of the avatar that are matched
@@ -29,6 +30,24 @@ _WHEN_FAR = ("approach",) * 3
 _SETTLE_EVERY = 2  # steps: with twice as many, training would take a fifth longer and the poses be 0.1 degrees better
 _AT_THE_END = ("settle",) * 3
 _FROM_THE_START = ("approach",) * 6 + ("settle",) * 6
+
+
+def require_refinable(avatar: TrainedField, store: SampleStore, setting: str) -> None:
+    """Check that poses of samples can be refined with an avatar.
+
+    Args:
+        avatar: trained or not.
+        store: samples.
+        setting: name of the setting that asks for it, for the message.
+
+    Raises:
+        ValueError: the system has no forward skinning, or the samples are planar.
+    """
+    if not isinstance(avatar.model, FastSnarf):
+        name = avatar.config.model.name
+        raise ValueError(f"{setting}: wanted model fast_snarf or snarf, got {name}, which has no forward skinning")
+    if store.manifest["settings"].get("is_planar", False):
+        raise ValueError(f"{setting}: wanted samples of surfaces in space, got planar ones; leave it out")
 
 
 class PoseRefiner:
@@ -47,24 +66,15 @@ class PoseRefiner:
         self._points: CanonicalPoints | None = None
 
     def renew_points(self, avatar: TrainedField) -> None:
-        """Take new points from the canonical surface of an avatar, equally many for every bone; keep the old if it has none."""
-        pose = torch.as_tensor(np.concatenate([s.poses for s in self.poses.sequences]).mean(0))
-        try:
-            mesh = canonical_surface(avatar, pose.float(), _RESOLUTION)
-        except (EmptySurface, FullSurface):
-            return
-        random = np.random.default_rng(self._seed)
-        owner = mesh.skinning_weights.argmax(1)
-        bones = np.unique(owner)
-        chosen = np.concatenate([random.choice(np.flatnonzero(owner == bone), -(-_POINTS // len(bones))) for bone in bones])
-        values = (mesh.vertices[chosen], mesh.unit_normals[chosen], mesh.skinning_weights[chosen])
-        self._points = CanonicalPoints(*(torch.as_tensor(v, dtype=torch.float32, device=avatar.device) for v in values))
+        """Match the frames of coming training steps with the present surface of an avatar; with the old one if it has none."""
+        self._points = self._points_of(avatar) or self._points
 
     def refine(self, model: FastSnarf, frames: Sequence[Frame], step: int, precision: str) -> None:
         """Refine the poses of the frames of a training step; they take effect without the common part of the corrections."""
         plans = {False: _WHEN_FAR} | ({True: _WHEN_NEAR} if step % _SETTLE_EVERY == 0 else {})
         for near, plan in plans.items():
-            self._refine(model, [frame for frame in frames if self.poses.is_near(frame) == near], plan, precision, centred=True)
+            some = [frame for frame in frames if self.poses.is_near(frame) == near]
+            self._refine(model, self._points, some, plan, precision, centred=True)
 
     def refine_all(self, avatar: TrainedField, frames: Sequence[Frame], *, desc: str) -> None:
         """Refine the poses of many frames with a finished avatar: with more steps those that are not near it yet.
@@ -75,19 +85,41 @@ class PoseRefiner:
             desc: label of the progress line.
         """
         assert isinstance(avatar.model, FastSnarf)
-        self.renew_points(avatar)
+        points = self._points_of(avatar)
         parts = []
         for near, plan in ((True, _AT_THE_END), (False, _FROM_THE_START)):
             chosen = [frame for frame in frames if self.poses.is_near(frame) == near]
             parts += [(plan, chosen[first : first + _FRAMES_AT_ONCE]) for first in range(0, len(chosen), _FRAMES_AT_ONCE)]
         for plan, part in progress(parts, desc=desc, unit="batches"):
-            self._refine(avatar.model, part, plan, "highest", centred=False)
+            self._refine(avatar.model, points, part, plan, "highest", centred=False)
 
-    def _refine(self, model: FastSnarf, frames: Sequence[Frame], plan: Sequence[str], precision: str, *, centred: bool) -> None:
+    def _points_of(self, avatar: TrainedField) -> CanonicalPoints | None:
+        """Return points on the canonical surface of an avatar, equally many for every bone; None if it has no surface."""
+        pose = torch.as_tensor(np.concatenate([s.poses for s in self.poses.sequences]).mean(0))
+        try:
+            mesh = canonical_surface(avatar, pose.float(), _RESOLUTION)
+        except (EmptySurface, FullSurface):
+            return None
+        random = np.random.default_rng(self._seed)
+        owner = mesh.skinning_weights.argmax(1)
+        bones = np.unique(owner)
+        chosen = np.concatenate([random.choice(np.flatnonzero(owner == bone), -(-_POINTS // len(bones))) for bone in bones])
+        values = (mesh.vertices[chosen], mesh.unit_normals[chosen], mesh.skinning_weights[chosen])
+        return CanonicalPoints(*(torch.as_tensor(v, dtype=torch.float32, device=avatar.device) for v in values))
+
+    def _refine(
+        self,
+        model: FastSnarf,
+        points: CanonicalPoints | None,
+        frames: Sequence[Frame],
+        plan: Sequence[str],
+        precision: str,
+        *,
+        centred: bool,
+    ) -> None:
         """Take the steps of a plan; see `RefinedPoses.refine`."""
-        if frames and self._points is not None:
-            fit = PoseFit(model, self.poses.skeleton, precision)
-            self.poses.refine(fit, self._points, frames, plan, centred=centred)
+        if frames and points is not None:
+            self.poses.refine(PoseFit(model, self.poses.skeleton, precision), points, frames, plan, centred=centred)
 
     def finish(self, avatar: TrainedField) -> None:
         """Refine the poses of all frames once more, with the finished avatar."""

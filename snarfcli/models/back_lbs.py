@@ -35,7 +35,7 @@ class BackLBS(PointwiseSystem):
         skinning, joints = self.config.skinning, skeleton.num_joints
         self.softmax = make_softmax(skinning.softmax, joints, skeleton.parents)
         falloff = skinning.prior_falloff_m
-        self.prior = None if falloff is None else BonePrior(*weight_segments(skeleton), joints, falloff)
+        self.prior = None if falloff is None else BonePrior(*weight_segments(skeleton, continued=True), joints, falloff)
         scale = float((grid.upper - grid.lower).max()) / 2
         self.weight_network = PosedNetwork(
             3 * (joints - 1), self.softmax.num_logits, self.config, scale, starts_at_zero=falloff is not None

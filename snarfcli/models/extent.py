@@ -25,14 +25,18 @@ def bone_owners(skeleton: Skeleton) -> list[int]:
     return [parent for parent, _ in skeleton.bones] + [leaf for leaf in _leaves(skeleton) if skeleton.parents[leaf] < 0]
 
 
-def weight_segments(skeleton: Skeleton) -> tuple[Tensor, list[int]]:
+def weight_segments(skeleton: Skeleton, *, continued: bool = False) -> tuple[Tensor, list[int]]:
     """Return the segments [S, 2, 3] that move with each joint, canonical frame, metres, and their joints, S numbers.
 
-    A joint moves the segments to its children; a joint without children moves the point where it is.
+    A joint moves the segments to its children; a joint without children moves the point where it is, or, if `continued`, the
+    continuation of the bone that ends there, as long as the bone: toes, fingers and the skull lie beyond the last joints.
     """
     joints = skeleton.canonical_joints
-    pairs = skeleton.bones + [(leaf, leaf) for leaf in _leaves(skeleton)]
-    return torch.stack([torch.stack([joints[start], joints[end]]) for start, end in pairs]), [start for start, _ in pairs]
+    ends = [(start, joints[end]) for start, end in skeleton.bones]
+    for leaf in _leaves(skeleton):
+        before = skeleton.parents[leaf] if continued and skeleton.parents[leaf] >= 0 else leaf
+        ends.append((leaf, 2 * joints[leaf] - joints[before]))
+    return torch.stack([torch.stack([joints[start], end]) for start, end in ends]), [start for start, _ in ends]
 
 
 def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: Skeleton) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -17,6 +17,7 @@ from snarfcli.deformer.weights import VoxelWeights
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.pieces import floating_cells
 from snarfcli.models.settings import AvatarConfig, ModelConfig
+from snarfcli.models.symmetry import find_mirror
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
 from snarfcli.shape import OccupancyNetwork
 
@@ -84,9 +85,22 @@ class FastSnarf(System):
             active = cells_near(grid, (depth, height, width), places)
             kept = cells_near(grid, (depth, height, width), [(bones, min(skinning.bone_radius_m, _KEPT_RADIUS_M))])
         if skinning.prior_falloff_m is not None:
-            prior = BonePrior(*weight_segments(skeleton), num_bones, skinning.prior_falloff_m)
+            prior = BonePrior(*weight_segments(skeleton, continued=True), num_bones, skinning.prior_falloff_m)
+        mirror = find_mirror(skeleton) if skinning.symmetric else None
+        if mirror is not None and not mirror.maps_to_itself(grid):
+            raise ValueError(
+                "skinning.symmetric: wanted a canonical box that is symmetric too, got another; see Mirror.complete"
+            )
         self.deformer = ForwardDeformer(
-            grid, num_bones, skinning, config.search, active, prior, parents=skeleton.parents, field=field
+            grid,
+            num_bones,
+            skinning,
+            config.search,
+            active,
+            prior,
+            parents=skeleton.parents,
+            field=field,
+            mirror=None if mirror is None else mirror.bones,
         )
         self.register_buffer("_kept_cells", kept, persistent=False)
         self.shape = self._make_shape(bones, (grid.lower, grid.upper))
@@ -150,6 +164,8 @@ class FastSnarf(System):
         if not bool(near.any()):
             return None
         kept = corners_of(near)
+        if field.mirror is not None:
+            kept = kept | kept.flip(2)
         field.extend_from(kept)
         return field.logits, ~kept.reshape(-1)
 
@@ -219,7 +235,7 @@ class FastSnarf(System):
             self.deformer.set_active_cells(cells)
 
     @torch.no_grad()
-    def drop_pieces(self, pose: Tensor, inside: list[tuple[FoundRoots, Tensor]], precision: str = "highest") -> int:
+    def drop_pieces(self, pose: Tensor, inside: Iterable[tuple[FoundRoots, Tensor]], precision: str = "highest") -> int:
         """Stop searching cells that hold nothing but pieces which do not belong to the subject (see `floating_cells`)."""
         if self.search.name != "complete":
             return 0
@@ -237,8 +253,9 @@ class FastSnarf(System):
         lattice = (torch.cat(places) - lower) * steps
         cells, dropped = floating_cells(samples[0, 0] > 0, finer, lattice, torch.cat(query), self.config.model.components)
         left = self.deformer.active_cells & ~cells
-        if dropped and bool(left.any()):
-            self.deformer.set_active_cells(left)
+        if not bool((cells & self.deformer.active_cells).any()) or not bool(left.any()):
+            return 0
+        self.deformer.set_active_cells(left)
         return dropped
 
     # ---------------------------------------------------------------- training

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -274,7 +275,7 @@ class System(nn.Module):
     def tighten_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Shrink the active cells to the final shape in poses [P, J, 3]."""
 
-    def drop_pieces(self, pose: Tensor, inside: list[tuple[Found, Tensor]], precision: str = "highest") -> int:
+    def drop_pieces(self, pose: Tensor, inside: Iterable[tuple[Found, Tensor]], precision: str = "highest") -> int:
         """Drop pieces of the final shape in poses [P, J, 3] that do not belong to the subject; return their number.
 
         Args:

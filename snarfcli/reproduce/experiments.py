@@ -122,7 +122,7 @@ _TABLE2 = Experiment(
         _SNARF,
         Row("fast_snarf-broyden", "Fast-SNARF, grid of the preset's network", _BROYDEN, _NETWORKS, "fast_snarf"),
         Row("voxel", "w/o MLP distillation, 64 x 64 x 16",
-            (*_BROYDEN, "skinning=voxel", "skinning.resolution=[64,64,16]"),
+            (*_BROYDEN, "skinning=voxel", "skinning.symmetric=false", "skinning.resolution=[64,64,16]"),
             ("shape=small", "training.agreement_weight=0.0", "training.extend_weights_every=0"), "voxel"),
         _grid("grid16", (16, 16, 4), "grid16"),
         _grid("grid32", (32, 32, 8), "grid32"),

@@ -1,4 +1,4 @@
-"""Poses that no frame shows: what the shape does in them is otherwise left to chance."""
+"""Random poses beyond the training frames, for the loss that keeps the shape from floating in them."""
 
 from __future__ import annotations
 

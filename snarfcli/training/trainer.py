@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
+from contextlib import closing
 from dataclasses import asdict, replace
 from functools import partial, reduce
 from typing import Any
@@ -17,7 +18,7 @@ from torch.nn import functional as F
 from snarfcli.deformer import NodeWeights
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import iou
-from snarfcli.fitting import PoseRefiner
+from snarfcli.fitting import PoseRefiner, require_refinable
 from snarfcli.models.extent import bone_owners, bone_segments
 from snarfcli.models.fast_snarf import FastSnarf
 from snarfcli.models.system import Found
@@ -35,12 +36,11 @@ __all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Diverged", "Trainer"]
 log = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = "snarf-checkpoint"
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
 
 _MADE_UP_POSES = 16  # per step with the loss for them
 _STEPS_OF_SUPPORT = 12  # whose inside points show which pieces of the shape belong to the subject
 _REFINE_FROM = 100  # step; before, the shape may lack whole limbs
-_NP = int(__import__("os").environ.get("NP", "2"))
 _RENEW_POINTS_EVERY = 100  # steps between two updates of the surface that refined poses are matched with
 _POSES_OF_A_REFRESH = 4  # number of training poses from which the searched cells are updated
 _POSES_AT_THE_END = 24  # the same for the finished avatar
@@ -122,18 +122,12 @@ class Trainer:
         return numbers
 
     def _new_refiner(self) -> PoseRefiner:
-        """Return what refines the poses of all training sequences; with their held-back frames, which no step sees.
+        """Return the pose refiner of all training sequences, including their held-back frames.
 
         Raises:
             ValueError: the system has no forward skinning, or the samples are planar.
         """
-        if self.store.manifest["settings"].get("is_planar", False):
-            raise ValueError("training.refine_poses: wanted samples of surfaces in space, got planar ones; leave it out")
-        if not isinstance(self.model, FastSnarf):
-            name = self.avatar.config.model.name
-            raise ValueError(
-                f"training.refine_poses: wanted model=fast_snarf or snarf, got {name}, which has no forward skinning"
-            )
+        require_refinable(self.avatar, self.store, "training.refine_poses")
         return PoseRefiner(self.store.sequences("train"), self.avatar.skeleton, self.device, self.seed)
 
     def _with_refined_poses(self, batch: Batch) -> Batch:
@@ -236,13 +230,13 @@ class Trainer:
         avatar = self.averaged_avatar()
         poses = self.batches.poses(_POSES_AT_THE_END)
         avatar.model.tighten_cells(poses, self.config.precision)
-        dropped = avatar.model.drop_pieces(poses, [self._found_inside(avatar, step) for step in range(_STEPS_OF_SUPPORT)])
+        with closing(self.batches):
+            inside = (self._found_inside(avatar, step) for step in range(_STEPS_OF_SUPPORT))
+            dropped = avatar.model.drop_pieces(poses, inside)
         if dropped:
             what = "a piece" if dropped == 1 else f"{dropped} pieces"
             log.info("dropped %s of the shape that no training mesh needs (model.components=N keeps the N largest)", what)
-        if self.refiner is not None:
-            avatar.model.freeze()
-            self.refiner.finish(avatar)
+        avatar.model.freeze()
         return avatar
 
     def _found_inside(self, avatar: TrainedField, step: int) -> tuple[Found, Tensor]:

@@ -149,10 +149,14 @@ def test_back_lbs_starts_from_the_distances_to_the_posed_bones(store):
     joints = avatar.skeleton.canonical_joints
     posed = torch.einsum("bjrc,jc->bjr", transforms[:, :, :3, :3], joints) + transforms[:, :, :3, 3]
     points = points_near(avatar, transforms, 100)
-    # the first joint moves the segment to the second; the second, a last one, the point where it is
-    start, along = posed[:, :1], posed[:, 1:] - posed[:, :1]
-    share = (((points - start) * along).sum(-1) / (along * along).sum(-1)).clamp(0, 1)[..., None]
-    distances = torch.stack([(points - start - share * along).norm(dim=-1), (points - posed[:, 1:]).norm(dim=-1)], -1)
+    # the first joint moves the segment to the second; the second, a last one, the continuation of this segment
+    beyond = transforms[:, 1:, :3, :3] @ (2 * joints[1] - joints[0]) + transforms[:, 1:, :3, 3]
+    distances = []
+    for start, end in ((posed[:, :1], posed[:, 1:]), (posed[:, 1:], beyond)):
+        along = end - start
+        share = (((points - start) * along).sum(-1) / (along * along).sum(-1)).clamp(0, 1)[..., None]
+        distances.append((points - start - share * along).norm(dim=-1))
+    distances = torch.stack(distances, -1)
     wanted = torch.softmax(-distances / avatar.config.skinning.prior_falloff_m, -1)
     torch.testing.assert_close(avatar.model.posed_weights(points, transforms, POSES), wanted, atol=1e-4, rtol=0)
 

@@ -66,8 +66,8 @@ def test_a_dry_run_prints_commands_and_does_nothing(capsys, caplog, elsewhere):
     assert "run 1 of 1: nasa: NASA, subject 50002, seed 0, outputs/builtin/50002/nasa-quick-s0-" in caplog.text
     assert "snarf preprocess subject='50002' data=builtin" in caplog.text
     assert (
-        "model=nasa condition=global shape=small skinning=coarse training.agreement_weight=0.0 training.steps=9 skinning.resolution=[8,8,4] seed=0"
-        in caplog.text
+        "model=nasa condition=global shape=small skinning=coarse training.agreement_weight=0.0 "
+        "training.steps=9 skinning.resolution=[8,8,4] seed=0" in caplog.text
     )
     assert not list(elsewhere.iterdir())
 

@@ -76,6 +76,7 @@ def test_poses_are_refined_while_the_avatar_is_learned(folder, tmp_path):
     better, worse = refining.validate(), given.validate()
     assert better["iou_surface"] > worse["iou_surface"] + 0.15
     avatar = refining.finished_avatar()
+    refining.refiner.finish(avatar)
     summary = refining.refiner.poses.summary()
     assert summary["frames"] == sum(s.num_frames for s in store.sequences("train"))
     assert summary["distance_m"] < 0.012
@@ -110,9 +111,32 @@ def test_resumed_training_has_the_same_poses(folder, tmp_path):
         assert torch.equal(mine, theirs)
 
 
-def test_hopeless_poses_are_counted(folder):
+def test_meshes_that_cannot_be_reached_are_counted(folder):
+    trainer = new_trainer(noisy_store(folder), refine_poses=True)
+    poses, sequence = trainer.refiner.poses, trainer.store.sequences("train")[0]
+    vertices = sequence.vertices
+    sequence.vertices = lambda frame: vertices(frame) + (3.0 if frame in (4, 5) else 0.0)
+    while trainer.step < 112:
+        trainer.advance()
+    trainer.refiner.finish(trainer.finished_avatar())
+    assert poses.count_misfits() >= 2
+    assert (poses.distance_m == torch.inf).nonzero()[:, 0].tolist() == [4, 5]
+    assert poses.summary()["distance_m"] < 0.03
+
+
+def test_validation_does_not_change_training(folder):
+    trainers = [new_trainer(noisy_store(folder), refine_poses=True) for _ in range(2)]
+    for trainer in trainers:
+        while trainer.step < 112:
+            if trainer is trainers[0] and trainer.step == 108:
+                trainer.validate()
+            trainer.advance()
+    for mine, theirs in zip(*(trainer.optimizer.parameters for trainer in trainers), strict=True):
+        assert torch.equal(mine, theirs)
+
+
+def test_planar_samples_and_other_systems_are_refused(folder):
     store = noisy_store(folder)
-    trainer = new_trainer(store, refine_poses=True)
-    for sequence in trainer.store.sequences("train"):
-        trainer.refiner.poses.distance_m[: sequence.num_frames] = 1.0
-    assert trainer.refiner.poses.count_misfits() == store.sequences("train")[0].num_frames
+    store.manifest["settings"] = {**store.manifest["settings"], "is_planar": True}
+    with pytest.raises(ValueError, match=r"training.refine_poses: wanted samples of surfaces in space, got planar ones"):
+        new_trainer(store, refine_poses=True)

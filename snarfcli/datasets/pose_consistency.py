@@ -15,7 +15,7 @@ from snarfcli.errors import UserError
 from snarfcli.sampling import uniform_surface_samples
 from snarfcli.segments import segment_distances
 
-__all__ = ["BonePosedMesh", "PoseFit", "measure_pose_fit"]
+__all__ = ["BonePosedMesh", "PoseConsistency", "measure_pose_consistency"]
 
 _POINTS = 3000  # per frame
 _FEWEST_POINTS = 8  # of a bone, in a frame
@@ -38,7 +38,7 @@ class BonePosedMesh(Protocol):
 
 
 @dataclass(frozen=True)
-class PoseFit:
+class PoseConsistency:
     """How far the surface near a bone moves relative to the bone, from one frame to another."""
 
     moved_m: float
@@ -51,7 +51,7 @@ class PoseFit:
     """Number of frames."""
 
 
-def measure_pose_fit(skeleton: Skeleton, frames: Sequence[BonePosedMesh]) -> PoseFit | None:
+def measure_pose_consistency(skeleton: Skeleton, frames: Sequence[BonePosedMesh]) -> PoseConsistency | None:
     """Measure how far the surface near each bone moves relative to the bone between frames.
 
     Surface points closest to the inner part of a bone are moved rigidly with this bone to the next frame, where their distance
@@ -78,7 +78,7 @@ def measure_pose_fit(skeleton: Skeleton, frames: Sequence[BonePosedMesh]) -> Pos
         seen |= np.isfinite(moved)
         if np.isfinite(moved).any():
             per_frame.append(np.nanmedian(moved))
-    return PoseFit(float(np.median(per_frame)), length, int(seen.sum()), len(usable)) if per_frame else None
+    return PoseConsistency(float(np.median(per_frame)), length, int(seen.sum()), len(usable)) if per_frame else None
 
 
 def _moved(skeleton: Skeleton, long: np.ndarray, first: BonePosedMesh, second: BonePosedMesh, seed: int) -> np.ndarray:

@@ -1,0 +1,89 @@
+"""Skeletons that are symmetric, and weights that are the same on both sides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from snarfcli.bodies import Skeleton, builtin_body
+from snarfcli.deformer import CanonicalGrid
+from snarfcli.deformer.hierarchy import make_softmax
+from snarfcli.deformer.weights import VoxelWeights
+from snarfcli.models.symmetry import find_mirror
+
+
+@pytest.fixture(scope="module")
+def skeleton() -> Skeleton:
+    body = builtin_body()
+    return body.skeleton(torch.zeros(body.num_betas))
+
+
+def test_a_body_is_symmetric_where_it_stands(skeleton):
+    moved = replace(skeleton, joints_rest=skeleton.joints_rest + torch.tensor([0.3, 0, 0]))
+    mirror = find_mirror(moved)
+    assert mirror is not None
+    assert mirror.bones == skeleton.left_right
+    assert mirror.plane == pytest.approx(0.3, abs=0.005)
+    points = torch.tensor([[-0.5, -1, -0.2], [0.9, 1, 0.2]])
+    assert not mirror.maps_to_itself(CanonicalGrid.around(points, [0, 0, 0]))
+    box = CanonicalGrid.around(mirror.complete(points), [0, 0, 0])
+    assert mirror.maps_to_itself(box)
+    assert box.lower.tolist() == pytest.approx([-0.5, -1, -0.2])
+    assert box.upper.tolist() == pytest.approx([1.1, 1, 0.2], abs=0.01)
+
+
+def test_a_skeleton_without_counterparts_is_not(skeleton):
+    bent = skeleton.joints_rest.clone()
+    bent[skeleton.names.index("l_hand")] += torch.tensor([0.0, 0.2, 0.0])
+    assert find_mirror(replace(skeleton, joints_rest=bent)) is None
+    names = tuple(f"joint_{number}" for number in range(24))
+    assert find_mirror(replace(skeleton, names=names)) is None
+    root = Skeleton(("root",), (-1,), torch.zeros(1, 3), torch.zeros(1, 3))
+    assert find_mirror(root) is None
+
+
+@pytest.mark.parametrize("kind", ["plain", "hierarchical"])
+def test_weights_at_mirrored_places_are_those_of_the_mirrored_bones(kind):
+    grid = CanonicalGrid(torch.tensor([-1.0, 0, 0]), torch.tensor([1.0, 1, 1]))
+    shape, mirror = (3, 4, 5), [0, 2, 1]
+    torch.manual_seed(0)
+    field = VoxelWeights(make_softmax(kind, 3, [-1, 0, 0]), grid, shape, 2.0, mirror=mirror)
+    torch.nn.init.normal_(field.logits)
+    points = torch.rand(50, 3) * torch.tensor([2.0, 1, 1]) - torch.tensor([1.0, 0, 0])
+    weights = field(points)
+    torch.testing.assert_close(weights.sum(1), torch.ones(50))
+    torch.testing.assert_close(field(points * torch.tensor([-1.0, 1, 1])), weights[:, mirror])
+    some = torch.tensor([0, 7, 33, 59])
+    torch.testing.assert_close(field.at_nodes(some), field.at_nodes()[some])
+    assert (weights[:, 1] - weights[:, 2]).abs().max() > 0.1
+
+
+def test_extended_weights_keep_the_symmetry():
+    grid = CanonicalGrid(torch.tensor([-1.0, 0, 0]), torch.tensor([1.0, 1, 1]))
+    field = VoxelWeights(make_softmax("plain", 3, None), grid, (3, 3, 6), 1.0, mirror=[0, 2, 1])
+    torch.nn.init.normal_(field.logits)
+    kept = torch.zeros(3, 3, 6, dtype=torch.bool)
+    kept[1, 1, 0] = kept[1, 1, 5] = True
+    before = field.at_nodes().reshape(3, 3, 6, 3)
+    field.extend_from(kept)
+    after = field.at_nodes().reshape(3, 3, 6, 3)
+    torch.testing.assert_close(after[kept], before[kept])
+    torch.testing.assert_close(after.flip(2)[..., [0, 2, 1]], after)
+
+
+def test_gradients_reach_both_sides():
+    grid = CanonicalGrid(torch.tensor([-1.0, 0, 0]), torch.tensor([1.0, 1, 1]))
+    field = VoxelWeights(make_softmax("plain", 3, None), grid, (2, 2, 4), 1.0, mirror=[0, 2, 1]).double()
+    torch.nn.init.normal_(field.logits)
+    nodes = torch.tensor([1, 6])
+
+    def of_logits(logits: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(field, {"logits": logits}, (field_points,))
+
+    field_points = field.lower + (field.upper - field.lower) * torch.rand(4, 3).double()
+    assert torch.autograd.gradcheck(of_logits, (field.logits.detach().clone().requires_grad_(),))
+    field.at_nodes(nodes)[:, 1].sum().backward()
+    touched = field.logits.grad.abs().sum(1).nonzero()[:, 0].tolist()
+    assert touched == [1, 2, 5, 6]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -202,8 +203,11 @@ class VoxelWeights(GridWeights):
         sharpness: factor before the softmax, which makes steps of the optimiser as large as those of the distilled field.
         prior: logits of a plain softmax to start from; without it all weights are equal at first.
         mirror: [J], the bone to which the plane through the middle of the box, across x, maps each. Weights at mirrored places
-            are then the same, for mirrored bones: the mean of those that are optimised on both sides. None for no symmetry.
+            are then the same, for mirrored bones, and only those at the nodes with x below the middle are optimised. None for
+            no symmetry.
     """
+
+    _mirror: Tensor
 
     def __init__(
         self,
@@ -215,44 +219,59 @@ class VoxelWeights(GridWeights):
         mirror: Sequence[int] | None = None,
     ) -> None:
         super().__init__(grid, shape)
-        self.mirror = None if mirror is None else list(mirror)
         self.softmax = softmax
         self.sharpness = sharpness
-        nodes = grid.nodes(shape).reshape(-1, 3)
+        self.is_symmetric = mirror is not None
+        self.register_buffer("_mirror", torch.tensor(list(mirror or ())), persistent=False)
+        self.columns = (shape[2] + 1) // 2 if self.is_symmetric else shape[2]
+        """Number of nodes along x at which weights are optimised."""
+        nodes = self.optimised(grid.nodes(shape)).reshape(-1, 3)
         start = nodes.new_zeros(len(nodes), softmax.num_logits) if prior is None else softmax.invert(prior(nodes)) / sharpness
         self.logits = nn.Parameter(start.detach().clone())
 
+    def optimised(self, values: Tensor) -> Tensor:
+        """Return those of values [D, H, W, ...] at all nodes that are at optimised ones, [D, H, columns, ...]."""
+        return values[:, :, : self.columns]
+
     def at_nodes(self, nodes: Tensor | None = None) -> Tensor:
         """Return the weights [..., J] at the nodes with flat indices [...], or of all nodes, [D * H * W, J]."""
-        if nodes is None:
-            weights = self.softmax(self.sharpness * self.logits)
-            if self.mirror is None:
-                return weights
-            other = weights.reshape(*self.shape, -1).flip(2)[..., self.mirror]
-            return (weights + other.reshape(weights.shape)) / 2
-        weights = self._weights_of(nodes.reshape(-1))
-        if self.mirror is not None:
-            column = nodes.reshape(-1) % self.shape[2]
-            other = self._weights_of(nodes.reshape(-1) + self.shape[2] - 1 - 2 * column)
-            weights = (weights + other[:, self.mirror]) / 2
-        return weights.reshape(*nodes.shape, -1)
+        if nodes is None and not self.is_symmetric:
+            return self.softmax(self.sharpness * self.logits)
+        nodes = torch.arange(math.prod(self.shape), device=self.logits.device) if nodes is None else nodes
+        flat = nodes.reshape(-1)
+        if not self.is_symmetric:
+            return self._weights_of(flat).reshape(*nodes.shape, -1)
+        last = self.shape[2] - 1
+        row = torch.div(flat, last + 1, rounding_mode="floor")
+        column = flat - row * (last + 1)
+        weights = self._weights_of(row * self.columns + torch.minimum(column, last - column))
+        # At nodes in the plane, if there are any, the weights are those of neither side.
+        share = (0.5 + 0.5 * torch.sign(2 * column - last))[:, None].to(weights)
+        return torch.lerp(weights, weights.index_select(1, self._mirror), share).reshape(*nodes.shape, -1)
 
-    def _weights_of(self, nodes: Tensor) -> Tensor:
-        """Return the weights [K, J] that are optimised at nodes with flat indices [K]."""
-        chosen = self.logits.index_select(0, nodes)  # whose gradient is faster than that of an index
+    def _weights_of(self, rows: Tensor) -> Tensor:
+        """Return the weights [K, J] at rows [K] of the logits."""
+        chosen = self.logits.index_select(0, rows)  # whose gradient is faster than that of an index
         return self.softmax(self.sharpness * chosen)
 
     @torch.no_grad()
-    def extend_from(self, nodes: Tensor) -> None:
+    def extend_from(self, nodes: Tensor) -> Tensor:
         """Make the weights of all but some nodes harmonic: each has the mean of its neighbours, which adds no extremes.
 
         Elsewhere than around the surface no sample determines the weights, and what training left there can tear parts off the
         body in unseen poses.
 
         Args:
-            nodes: [D, H, W], bool, the nodes that keep their weights, at least one.
+            nodes: [D, H, W], bool, the nodes that keep their weights, at least one; their images too if there is a symmetry.
+
+        Returns:
+            Which rows of the logits have changed, bool.
         """
+        if self.is_symmetric:
+            nodes = nodes | nodes.flip(2)
         size = CanonicalGrid(self.lower, self.upper, checked=True).cell_size(self.shape)
         weights = harmonic(self.at_nodes().reshape(*self.shape, -1), nodes, size, _SOLVED).clamp_min(_LEAST_WEIGHT)
-        logits = self.softmax.invert(weights.log().reshape(-1, weights.shape[-1])) / self.sharpness
-        self.logits.copy_(torch.where(nodes.reshape(-1, 1), self.logits, logits))
+        logits = self.softmax.invert(self.optimised(weights).log().reshape(-1, weights.shape[-1])) / self.sharpness
+        kept = self.optimised(nodes).reshape(-1)
+        self.logits.copy_(torch.where(kept[:, None], self.logits, logits))
+        return ~kept

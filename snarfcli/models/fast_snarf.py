@@ -163,11 +163,7 @@ class FastSnarf(System):
         near = F.max_pool3d(self.surface_cells(pose, precision)[None, None].float(), 3, 1, 1)[0, 0] > 0
         if not bool(near.any()):
             return None
-        kept = corners_of(near)
-        if field.mirror is not None:
-            kept = kept | kept.flip(2)
-        field.extend_from(kept)
-        return field.logits, ~kept.reshape(-1)
+        return field.logits, field.extend_from(corners_of(near))
 
     @torch.no_grad()
     def surface_cells(self, pose: Tensor, precision: str = "highest") -> Tensor:

@@ -44,20 +44,31 @@ def test_a_skeleton_without_counterparts_is_not(skeleton):
     assert find_mirror(root) is None
 
 
-@pytest.mark.parametrize("kind", ["plain", "hierarchical"])
-def test_weights_at_mirrored_places_are_those_of_the_mirrored_bones(kind):
+@pytest.mark.parametrize(("kind", "width"), [("plain", 6), ("plain", 5), ("hierarchical", 4)])
+def test_weights_at_mirrored_places_are_those_of_the_mirrored_bones(kind, width):
     grid = CanonicalGrid(torch.tensor([-1.0, 0, 0]), torch.tensor([1.0, 1, 1]))
-    shape, mirror = (3, 4, 5), [0, 2, 1]
+    mirror = [0, 2, 1]
     torch.manual_seed(0)
-    field = VoxelWeights(make_softmax(kind, 3, [-1, 0, 0]), grid, shape, 2.0, mirror=mirror)
+    field = VoxelWeights(make_softmax(kind, 3, [-1, 0, 0]), grid, (3, 4, width), 2.0, mirror=mirror)
     torch.nn.init.normal_(field.logits)
     points = torch.rand(50, 3) * torch.tensor([2.0, 1, 1]) - torch.tensor([1.0, 0, 0])
     weights = field(points)
     torch.testing.assert_close(weights.sum(1), torch.ones(50))
     torch.testing.assert_close(field(points * torch.tensor([-1.0, 1, 1])), weights[:, mirror])
-    some = torch.tensor([0, 7, 33, 59])
+    some = torch.tensor([[0, 7], [33, 12 * width - 1]])
     torch.testing.assert_close(field.at_nodes(some), field.at_nodes()[some])
     assert (weights[:, 1] - weights[:, 2]).abs().max() > 0.1
+
+
+def test_weights_below_the_middle_are_those_without_symmetry():
+    grid = CanonicalGrid(torch.tensor([-1.0, 0, 0]), torch.tensor([1.0, 1, 1]))
+    torch.manual_seed(0)
+    plain = VoxelWeights(make_softmax("plain", 3, None), grid, (3, 4, 6), 2.0)
+    torch.nn.init.normal_(plain.logits)
+    field = VoxelWeights(make_softmax("plain", 3, None), grid, (3, 4, 6), 2.0, mirror=[0, 2, 1])
+    with torch.no_grad():
+        field.logits.copy_(field.optimised(plain.logits.reshape(3, 4, 6, 3)).reshape(-1, 3))
+    torch.testing.assert_close(field.at_nodes().reshape(3, 4, 6, 3)[:, :, :3], plain.at_nodes().reshape(3, 4, 6, 3)[:, :, :3])
 
 
 def test_extended_weights_keep_the_symmetry():
@@ -65,25 +76,25 @@ def test_extended_weights_keep_the_symmetry():
     field = VoxelWeights(make_softmax("plain", 3, None), grid, (3, 3, 6), 1.0, mirror=[0, 2, 1])
     torch.nn.init.normal_(field.logits)
     kept = torch.zeros(3, 3, 6, dtype=torch.bool)
-    kept[1, 1, 0] = kept[1, 1, 5] = True
-    before = field.at_nodes().reshape(3, 3, 6, 3)
-    field.extend_from(kept)
+    kept[1, 1, 0] = kept[0, 1, 4] = True
+    before, logits = field.at_nodes().reshape(3, 3, 6, 3), field.logits.detach().clone()
+    changed = field.extend_from(kept)
     after = field.at_nodes().reshape(3, 3, 6, 3)
     torch.testing.assert_close(after[kept], before[kept])
     torch.testing.assert_close(after.flip(2)[..., [0, 2, 1]], after)
+    assert (field.logits != logits).any(1).tolist() == changed.tolist()
+    assert changed.sum() == 3 * 3 * 3 - 2
 
 
-def test_gradients_reach_both_sides():
+def test_gradients_come_from_both_sides():
     grid = CanonicalGrid(torch.tensor([-1.0, 0, 0]), torch.tensor([1.0, 1, 1]))
     field = VoxelWeights(make_softmax("plain", 3, None), grid, (2, 2, 4), 1.0, mirror=[0, 2, 1]).double()
     torch.nn.init.normal_(field.logits)
-    nodes = torch.tensor([1, 6])
+    points = field.lower + (field.upper - field.lower) * torch.rand(4, 3).double()
 
     def of_logits(logits: torch.Tensor) -> torch.Tensor:
-        return torch.func.functional_call(field, {"logits": logits}, (field_points,))
+        return torch.func.functional_call(field, {"logits": logits}, (points,))
 
-    field_points = field.lower + (field.upper - field.lower) * torch.rand(4, 3).double()
     assert torch.autograd.gradcheck(of_logits, (field.logits.detach().clone().requires_grad_(),))
-    field.at_nodes(nodes)[:, 1].sum().backward()
-    touched = field.logits.grad.abs().sum(1).nonzero()[:, 0].tolist()
-    assert touched == [1, 2, 5, 6]
+    field.at_nodes(torch.tensor([1, 7]))[:, 1].sum().backward()
+    assert field.logits.grad.abs().sum(1).nonzero()[:, 0].tolist() == [1, 2]  # the last node of a row is the image of the first

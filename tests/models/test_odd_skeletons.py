@@ -69,6 +69,20 @@ def test_odd_skeletons_train_with_every_search_and_softmax(name, tmp_path):
     assert np.ptp(mesh.vertices[:, 0]) > 0.1
 
 
+@pytest.mark.parametrize("name", ODD)
+def test_poses_of_odd_skeletons_can_be_refined(name, tmp_path, monkeypatch):
+    monkeypatch.setattr("snarfcli.training.trainer._REFINE_FROM", 2)
+    store = odd_store(tmp_path, name)
+    training = training_config(steps=8, bootstrap_steps=2, refresh_cells_every=2, refine_poses=True, agreement_weight=1.0)
+    trainer = Trainer(new_avatar(store, avatar_config(capsules=True)), store, training, 0, torch.device("cpu"))
+    losses = [trainer.advance()["total"] for _ in range(8)]
+    assert np.isfinite(losses).all()
+    avatar = trainer.finished_avatar()
+    trainer.refiner.finish(avatar)
+    assert trainer.refiner.poses.summary()["frames"] == 4
+    assert np.isfinite(trainer.store.sequences("train")[0].poses).all()
+
+
 def test_a_root_alone_is_a_point_among_the_bones():
     bones = bone_segments(skeleton_of(*ODD["a root alone"]))
     assert bones.shape == (2, 2, 3)

@@ -176,8 +176,8 @@ def _report_poses(poses: RefinedPoses, folder: Path) -> None:
     failed, frames = poses.count_misfits(), poses.num_frames
     if failed:
         log.warning(
-            "warning: the poses of %d of %d frames could not be refined (their meshes are more than %.1f cm from the avatar); "
-            "the run is kept; leave these frames out, or start from better poses",
+            "warning: the poses of %d of %d frames could not be refined (their meshes are more than %.1f cm from the avatar) "
+            "and stay as given; the run is kept; train for more steps, start from better poses, or leave these frames out",
             failed, frames, 100 * poses.misfit_m,
         )  # fmt: skip
 

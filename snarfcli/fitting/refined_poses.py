@@ -97,6 +97,28 @@ class RefinedPoses:
             self._in_effect.put(rows, self._centred(corrections, rows) if centred else corrections)
             self._take_effect(frames, rows)
 
+    def forget(self, frames: Sequence[Frame]) -> None:
+        """Give frames the poses back that they came with, as if they had never been refined."""
+        rows = self._rows(frames)
+        self.distance_m[rows] = torch.nan
+        self._reset(frames, rows)
+
+    def give_up_misfits(self) -> None:
+        """Give the frames that could not be refined the poses back that they came with; `count_misfits` still counts them."""
+        rows = (self.distance_m > self.misfit_m).nonzero()[:, 0]
+        if len(rows):
+            self._reset(self._frames_of(rows), rows)
+
+    def _reset(self, frames: Sequence[Frame], rows: Tensor) -> None:
+        none = Corrections.none(len(rows), self.skeleton.num_joints, self.corrections.turn)
+        self.corrections.put(rows, none)
+        self._in_effect.put(rows, none)
+        joints = self._corrector.joints(self._given_poses(frames)[0].cpu()).numpy()
+        for number, (sequence, frame) in enumerate(frames):
+            poses, transforms, translation = self._given[self._place[id(sequence)]]
+            sequence.poses[frame], sequence.bone_transforms[frame] = poses[frame], transforms[frame]
+            sequence.translation[frame], sequence.joints[frame] = translation[frame], joints[number]
+
     def common_part(self) -> Corrections:
         """Return the mean of the corrections of training frames made so far, the shift in the axes of the root.
 

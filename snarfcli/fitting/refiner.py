@@ -122,9 +122,10 @@ class PoseRefiner:
             self.poses.refine(PoseFit(model, self.poses.skeleton, precision), points, frames, plan, centred=centred)
 
     def finish(self, avatar: TrainedField) -> None:
-        """Refine the poses of all frames once more, with the finished avatar."""
+        """Refine the poses of all frames once more, with the finished avatar; those out of its reach keep the given poses."""
         frames = [(sequence, frame) for sequence in self.poses.sequences for frame in range(sequence.num_frames)]
         self.refine_all(avatar, frames, desc="refine poses")
+        self.poses.give_up_misfits()
 
     def state(self) -> dict[str, Any]:
         """Return what a resumed run needs."""

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 __all__ = ["floating_cells"]
 
-_NEEDED = 0.5  # share of the inside points in a piece that are in no larger piece too
+_NEEDED = 0.2  # share of the inside points in a piece that are in no larger piece too
 
 
 def floating_cells(
@@ -21,8 +21,8 @@ def floating_cells(
 ) -> tuple[Tensor, int]:
     """Return which cells hold nothing but pieces of a shape that do not belong to the subject.
 
-    The largest piece belongs to it, and so does every piece that is needed: most points inside the meshes that come from there
-    come from no larger piece. A piece that is hidden in the body in all training poses is not needed.
+    The largest piece belongs to it, and so does every piece that is needed: a fifth of the points inside the meshes that come
+    from there, or more, come from no larger piece. A piece that is hidden in the body in all training poses is not needed.
 
     Args:
         occupied: [z, y, x], bool, samples of the shape on a lattice that has the nodes of the cells and samples between them.

@@ -235,7 +235,10 @@ class Trainer:
             dropped = avatar.model.drop_pieces(poses, inside)
         if dropped:
             what = "a piece" if dropped == 1 else f"{dropped} pieces"
-            log.info("dropped %s of the shape that no training mesh needs (model.components=N keeps the N largest)", what)
+            wanted = self.avatar.config.model.components
+            why = "no point inside a training mesh needs it; model.components=N keeps the N largest" if wanted is None else ""
+            why = why or f"model.components={wanted}"
+            log.info("dropped %s of the shape beside the body (%s)", what, why)
         avatar.model.freeze()
         return avatar
 
@@ -262,6 +265,8 @@ class Trainer:
             inside, occupied = inside[0].cpu().numpy(), batch.occupied[0].cpu().numpy()
             half = len(inside) // 2
             values.append([iou(inside[:half], occupied[:half]), iou(inside[half:], occupied[half:])])
+        if self.refiner is not None:
+            self.refiner.poses.forget(frames)  # so that a resumed run, which validates again, has the same poses
         if not values:
             return {}
         bbox, surface = np.mean(values, 0)

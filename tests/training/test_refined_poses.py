@@ -120,6 +120,9 @@ def test_meshes_that_cannot_be_reached_are_counted(folder):
         trainer.advance()
     trainer.refiner.finish(trainer.finished_avatar())
     assert poses.count_misfits() >= 2
+    given = noisy_store(folder).sequences("train")[0]
+    np.testing.assert_allclose(sequence.poses[4:6], given.poses[4:6], atol=1e-5)
+    np.testing.assert_allclose(sequence.translation[4:6], given.translation[4:6], atol=1e-6)
     assert (poses.distance_m == torch.inf).nonzero()[:, 0].tolist() == [4, 5]
     assert poses.summary()["distance_m"] < 0.03
 
@@ -129,8 +132,10 @@ def test_validation_does_not_change_training(folder):
     for trainer in trainers:
         while trainer.step < 112:
             if trainer is trainers[0] and trainer.step == 108:
-                trainer.validate()
+                assert trainer.validate() == trainer.validate()
             trainer.advance()
+    for mine, theirs in zip(*(trainer.store.sequences("train") for trainer in trainers), strict=True):
+        np.testing.assert_array_equal(mine.poses, theirs.poses)
     for mine, theirs in zip(*(trainer.optimizer.parameters for trainer in trainers), strict=True):
         assert torch.equal(mine, theirs)
 

@@ -129,7 +129,8 @@ def run(config: TrainConfig) -> None:
     if config.resume and started:
         state = load_checkpoint(checkpoint, CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
         trainer.restore(state, str(checkpoint))
-        if trainer.step >= config.training.steps and (folder / "avatar.pt").exists():
+        results = ["avatar.pt"] if trainer.refiner is None else ["avatar.pt", "refined_poses.npz"]
+        if trainer.step >= config.training.steps and all((folder / name).exists() for name in results):
             log.info("already trained: %s, nothing left to do", folder / "avatar.pt")
             return
         log.info("resuming at step %d of %d", trainer.step, config.training.steps)

@@ -27,7 +27,7 @@ _FRAMES_AT_ONCE = 16
 # Plans of steps. Closest points would undo what the field's distances have reached, so they only serve frames that are far.
 _WHEN_NEAR = ("settle",)
 _WHEN_FAR = ("approach",) * 3
-_SETTLE_EVERY = 2  # steps: with twice as many, training would take a fifth longer and the poses be 0.1 degrees better
+_SETTLE_EVERY = 2  # steps: with 1, the poses were no better
 _AT_THE_END = ("settle",) * 3
 _FROM_THE_START = ("approach",) * 6 + ("settle",) * 6
 

@@ -20,8 +20,8 @@ class ModelConfig:
     blend_sharpness: float = 1.0
     """Factor before the softmax of the blend (5 on occupancies in the released code)."""
     components: int | None = None
-    """Number of connected pieces of the canonical shape that a finished avatar keeps, largest first; null keeps all pieces with
-    points inside the training meshes. Only for forward skinning."""
+    """Number of connected pieces of the canonical shape that a finished avatar keeps, largest first; null keeps all pieces
+    that points inside the training meshes need. Only for forward skinning."""
     part_width: int = 40
     """Width of the hidden layers of each part's network (nasa, piecewise)."""
     part_depth: int = 4

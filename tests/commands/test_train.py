@@ -7,6 +7,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from toy_training import avatar_config, toy_store, training_config
@@ -15,6 +16,7 @@ from snarfcli.avatar import Avatar
 from snarfcli.commands.train import TrainConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
+from snarfcli.fitting import PoseRefiner
 from snarfcli.samples.store import SampleStore
 from snarfcli.training.trainer import Trainer
 
@@ -106,6 +108,31 @@ def test_an_interrupted_run_resumes_to_the_same_avatar(config, monkeypatch, capl
         run(replace(config, resume=True, seed=1))
     run(replace(config, overwrite=True, seed=1))
     assert (folder_of(config) / "avatar.pt").read_bytes() != before
+
+
+def test_an_interrupt_while_poses_are_finished_loses_nothing(config, monkeypatch):
+    monkeypatch.setattr("snarfcli.training.trainer._REFINE_FROM", 2)
+    config = replace(config, training=replace(config.training, refine_poses=True))
+    finish = PoseRefiner.finish
+
+    def interrupted(self, avatar):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PoseRefiner, "finish", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(config)
+    assert {path.name for path in folder_of(config).iterdir()} == FILES - {"metrics.json"}
+    monkeypatch.setattr(PoseRefiner, "finish", finish)
+    run(replace(config, resume=True))
+    assert {path.name for path in folder_of(config).iterdir()} == FILES | {"refined_poses.npz"}
+    metrics = json.loads((folder_of(config) / "metrics.json").read_text())
+    assert metrics["refined_poses"]["frames"] > 0
+    before = (folder_of(config) / "refined_poses.npz").read_bytes()
+    run(replace(config, resume=True))
+    assert (folder_of(config) / "refined_poses.npz").read_bytes() == before
+    run(replace(config, run="whole"))
+    poses = [np.load(folder_of(replace(config, run=name)) / "refined_poses.npz")["poses"] for name in ("mine", "whole")]
+    np.testing.assert_array_equal(*poses)
 
 
 def test_a_damaged_checkpoint_is_named_and_left(config):

@@ -92,11 +92,11 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
     """Report whether a data set can be used and what to correct; draw each examined subject."""
     from snarfcli.datasets.checking import ExaminedFrame, Remark, check_subject
     from snarfcli.datasets.registry import find_dataset
-    from snarfcli.datasets.request import DataRequest
+    from snarfcli.datasets.sources import Request
     from snarfcli.datasets.subjects import SubjectData
     from snarfcli.rendering.bones import write_bones_figure
 
-    request = DataRequest(data, Path(config.data_root), config.body)
+    request = Request(data, Path(config.data_root), config.body)
     subjects = [config.subject] if config.subject not in (None, "all") else list(find_dataset(data.name).subjects(request))
     chosen = subjects if config.subject is not None else subjects[:_SUBJECTS_CHECKED]
     log.info("data set %s, subjects: %s", data.name, _listed(subjects))

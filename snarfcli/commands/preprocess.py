@@ -61,7 +61,7 @@ def run(config: PreprocessConfig) -> None:
         OSError: the data folder cannot be written to, or the disk is full.
     """
     from snarfcli.datasets.registry import find_dataset
-    from snarfcli.datasets.request import DataRequest
+    from snarfcli.datasets.sources import Request
     from snarfcli.parallel import count_cores
     from snarfcli.samples.preprocessing import preprocess_subject
     from snarfcli.sampling import SamplingSettings
@@ -85,7 +85,7 @@ def run(config: PreprocessConfig) -> None:
     if config.workers < 0:
         raise UserError(f"workers: wanted a number of processes, or 0 for one per core, got {config.workers}")
     workers = config.workers or count_cores()
-    request = DataRequest(config.data, Path(config.data_root), config.body)
+    request = Request(config.data, Path(config.data_root), config.body)
     for subject in dataset.subjects(request) if config.subject == "all" else [config.subject]:
         data = dataset.load(subject, request)
         log.info("subject %s of %s data, %d processes", data.subject, data.data, workers)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from snarfcli.bodies import Body, BodyNotFound, builtin_body, find_body, load_body
 from snarfcli.checks import check_choice
 from snarfcli.datasets.amass_files import SMPL_BETAS, AmassSubject, amass_sequences, sequence_name, walk_files
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import SPLITS, Split, held_back_start, split_sequences
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData, body_sequence, body_template
 from snarfcli.errors import UserError, nearest
@@ -46,7 +46,7 @@ _LEFT_OUT = ("processed", "outputs")  # written by snarf
 _FEWEST_SEQUENCES = 5  # of which a fifth is at least one
 
 
-def subjects(request: DataRequest) -> tuple[str, ...]:
+def subjects(request: Request) -> tuple[str, ...]:
     """Return the names of all subjects.
 
     Raises:
@@ -55,7 +55,7 @@ def subjects(request: DataRequest) -> tuple[str, ...]:
     return tuple(_subject_places(request))
 
 
-def load(subject: str, request: DataRequest) -> SubjectData:
+def load(subject: str, request: Request) -> SubjectData:
     """Read one subject.
 
     Raises:
@@ -94,11 +94,11 @@ def load(subject: str, request: DataRequest) -> SubjectData:
 
 
 # ---------------------------------------------------------------- files
-def _folder(request: DataRequest) -> Path:
+def _folder(request: Request) -> Path:
     return request.folder if request.config.folder is not None else request.data_root / "amass"
 
 
-def _subject_places(request: DataRequest) -> dict[str, Path]:
+def _subject_places(request: Request) -> dict[str, Path]:
     """Return the folder of each subject by name.
 
     Raises:
@@ -133,7 +133,7 @@ def _name_sequences(place: Path) -> dict[str, Path]:
 
 
 # ---------------------------------------------------------------- the person
-def _read_person(files: Mapping[str, Path], place: Path, request: DataRequest) -> tuple[AmassSubject, dict[str, str]]:
+def _read_person(files: Mapping[str, Path], place: Path, request: Request) -> tuple[AmassSubject, dict[str, str]]:
     """Return the body in the shape of the subject, and the sequences whose shape cannot be read, with the reason."""
     beside = [folder / "shape.npz" for folder in (place, *(path.parent for path in files.values()))]
     given = next((path for path in beside if path.is_file()), None)
@@ -166,7 +166,7 @@ def _read_person(files: Mapping[str, Path], place: Path, request: DataRequest) -
     return AmassSubject(body, betas, body.skeleton(betas), (source, source_of_shape)), unreadable
 
 
-def _find_body(request: DataRequest, gender: str) -> tuple[Body, str, bool]:
+def _find_body(request: Request, gender: str) -> tuple[Body, str, bool]:
     """Return the body, its origin, and whether it is the built-in one, which is used if SMPL's of this gender is not found."""
     try:
         path = find_body(request.body or request.data_root, "smpl", gender)

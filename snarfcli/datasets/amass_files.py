@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
 from snarfcli.bodies import Body, Skeleton, find_body, load_body
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import Split
 from snarfcli.datasets.subjects import SequenceSpec, body_sequence
 from snarfcli.errors import UserError
@@ -115,7 +115,7 @@ class AmassSubject:
     """The files that were read, for the manifest."""
 
 
-def read_amass_subject(files: Mapping[str, Path], request: DataRequest) -> AmassSubject:
+def read_amass_subject(files: Mapping[str, Path], request: Request) -> AmassSubject:
     """Return the subject of some sequences: shape and gender from `shape.npz` beside them or from a sequence, and the body.
 
     Raises:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Body, builtin_body, find_body, load_body
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import Split
 from snarfcli.datasets.subjects import SubjectData, body_sequence, body_template
 from snarfcli.errors import UserError, nearest
@@ -68,12 +68,12 @@ def require_subject(subject: str) -> None:
         raise UserError(f"no built-in subject '{subject}'{hint} Wanted one of {', '.join(BUILTIN_SUBJECTS)}")
 
 
-def subjects(request: DataRequest) -> tuple[str, ...]:
+def subjects(request: Request) -> tuple[str, ...]:
     """Return the ids of the built-in subjects."""
     return BUILTIN_SUBJECTS
 
 
-def load(subject: str, request: DataRequest) -> SubjectData:
+def load(subject: str, request: Request) -> SubjectData:
     """Return a built-in subject with the built-in body or the requested one."""
     if request.body is None:
         return builtin_subject(subject)

@@ -19,7 +19,7 @@ import torch
 
 from snarfcli.bodies import Body, find_body, load_body
 from snarfcli.datasets.cape_frames import CapeMeshes, read_cape_frame
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import SPLITS, Split, split_sequences
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData, body_template
 from snarfcli.errors import UserError, nearest
@@ -37,7 +37,7 @@ _FRAME_RATE = 60.0
 _JOINTS = 24
 
 
-def subjects(request: DataRequest) -> tuple[str, ...]:
+def subjects(request: Request) -> tuple[str, ...]:
     """Return the available subjects, such as `00032_longshort`.
 
     Raises:
@@ -50,7 +50,7 @@ def subjects(request: DataRequest) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-def load(subject: str, request: DataRequest) -> SubjectData:
+def load(subject: str, request: Request) -> SubjectData:
     """Return one person in one outfit; frames that cannot be read are left out and listed.
 
     Raises:
@@ -78,7 +78,7 @@ def load(subject: str, request: DataRequest) -> SubjectData:
     return SubjectData("cape", name, skeleton, tuple(sequences), template, np.zeros(0), sources, tuple(broken))
 
 
-def _release(request: DataRequest) -> Path:
+def _release(request: Request) -> Path:
     """Return the folder that holds `sequences`."""
     folder = request.folder
     places = [folder, folder / "cape_release", *sorted(folder.glob("*/cape_release")), *sorted(folder.glob("*/*/cape_release"))]
@@ -100,7 +100,7 @@ def _person_and_outfit(subject: str, known: Sequence[str]) -> tuple[str, str]:
     return person, outfit
 
 
-def _minimal_body(person: str, release: Path, request: DataRequest) -> tuple[Body, tuple[str, ...]]:
+def _minimal_body(person: str, release: Path, request: Request) -> tuple[Body, tuple[str, ...]]:
     """Return the SMPL body of a person, with the scanned minimal shape as template, and the files that were read."""
     genders_file = release / "misc" / "subj_genders.pkl"
     genders = read_pickle(genders_file, "list of genders")

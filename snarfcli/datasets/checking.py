@@ -13,7 +13,7 @@ import torch
 from snarfcli.bodies import Skeleton
 from snarfcli.datasets.pose_consistency import measure_pose_consistency
 from snarfcli.datasets.registry import find_dataset
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.errors import UserError, one_line
 from snarfcli.sampling import check_mesh
@@ -66,7 +66,7 @@ class ExaminedFrame:
 
 
 def check_subject(
-    subject: str, request: DataRequest, draw: Callable[[SubjectData, list[ExaminedFrame]], Remark] | None = None
+    subject: str, request: Request, draw: Callable[[SubjectData, list[ExaminedFrame]], Remark] | None = None
 ) -> Iterator[Remark]:
     """Yield remarks about one subject.
 

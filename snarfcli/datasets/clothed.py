@@ -18,18 +18,18 @@ from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject, require
 from snarfcli.datasets.folds import Folds, place_folds
 from snarfcli.datasets.garment import ClothedMesh, Outfit, dress
 from snarfcli.datasets.posed_meshes import ArrayMeshes, BodyMeshes
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
 
 __all__ = ["ClothedBody", "ClothedMeshes", "clothed_subject", "load", "outfit_of", "subjects"]
 
 
-def subjects(request: DataRequest) -> tuple[str, ...]:
+def subjects(request: Request) -> tuple[str, ...]:
     """Return the ids of the built-in subjects."""
     return BUILTIN_SUBJECTS
 
 
-def load(subject: str, request: DataRequest) -> SubjectData:
+def load(subject: str, request: Request) -> SubjectData:
     """Return a built-in subject in clothes, with the built-in body or the requested one."""
     if request.body is None:
         return clothed_subject(subject)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from snarfcli.checks import check_choice
 from snarfcli.datasets.amass_files import amass_sequences, find_sequences, find_subjects, papers_split, read_amass_subject
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import Split, same_split
 from snarfcli.datasets.subjects import SubjectData, body_template
 from snarfcli.errors import UserError, nearest
@@ -21,7 +21,7 @@ __all__ = ["load", "require_subject_files", "subjects"]
 log = logging.getLogger(__name__)
 
 
-def subjects(request: DataRequest) -> tuple[str, ...]:
+def subjects(request: Request) -> tuple[str, ...]:
     """Return the ids of the papers' subjects that have files.
 
     Raises:
@@ -34,7 +34,7 @@ def subjects(request: DataRequest) -> tuple[str, ...]:
     return found
 
 
-def load(subject: str, request: DataRequest) -> SubjectData:
+def load(subject: str, request: Request) -> SubjectData:
     """Return one subject in the split of the papers.
 
     Raises:
@@ -61,7 +61,7 @@ def load(subject: str, request: DataRequest) -> SubjectData:
     )
 
 
-def require_subject_files(subject: str, request: DataRequest) -> tuple[dict[str, Path], dict[str, Split]]:
+def require_subject_files(subject: str, request: Request) -> tuple[dict[str, Path], dict[str, Split]]:
     """Return the files of a subject's sequences, and the papers' split of each sequence.
 
     Raises:
@@ -78,7 +78,7 @@ def require_subject_files(subject: str, request: DataRequest) -> tuple[dict[str,
     return files, splits
 
 
-def _nothing(whose: str, subject: str, request: DataRequest) -> str:
+def _nothing(whose: str, subject: str, request: Request) -> str:
     return (
         f"no DFaust sequences {whose} below {request.folder}: wanted AMASS files such as "
         f"DFaust_67/{subject}/{subject}_hips_poses.npz; see data/README.md, or give data.folder=FOLDER"

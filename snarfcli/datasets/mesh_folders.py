@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.rigged import RIG_SUFFIXES
+from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError, nearest
 
 __all__ = [
@@ -31,7 +31,7 @@ _POSE_FILES = ("poses.npz", "poses.json", "motion.bvh")
 _NO_POSES = ("split.json", *_SKELETON_FILES)
 
 
-def meshes_folder(request: DataRequest) -> Path:
+def meshes_folder(request: Request) -> Path:
     """Return the folder of the subjects.
 
     Raises:
@@ -44,7 +44,7 @@ def meshes_folder(request: DataRequest) -> Path:
     return folder
 
 
-def subject_places(request: DataRequest) -> dict[str, Path]:
+def subject_places(request: Request) -> dict[str, Path]:
     """Return the folder or rigged file of each subject by name; the request may also name the folder of one subject.
 
     Raises:
@@ -60,7 +60,7 @@ def subject_places(request: DataRequest) -> dict[str, Path]:
     return dict(sorted((files | folders).items()))
 
 
-def find_subject(subject: str, request: DataRequest) -> Path:
+def find_subject(subject: str, request: Request) -> Path:
     """Return the folder or rigged file of a subject.
 
     Raises:

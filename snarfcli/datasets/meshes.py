@@ -57,10 +57,10 @@ from snarfcli.datasets.mesh_folders import (
 )
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
 from snarfcli.datasets.recorded_sequence import FileToWorld, RecordedSequence, person_scale
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.rigged import bvh_poses, bvh_skeleton, read_rigged_files
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.skeleton_files import SkeletonFile, read_poses, read_skeleton
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import SPLITS, Split, split_sequences
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
@@ -73,7 +73,7 @@ __all__ = ["load", "subjects"]
 _SCALE_LIMITS = (1e-6, 1e6)  # metres per unit, from micrometres to 1000 km
 
 
-def subjects(request: DataRequest) -> tuple[str, ...]:
+def subjects(request: Request) -> tuple[str, ...]:
     """Return the names of all subjects.
 
     Raises:
@@ -87,7 +87,7 @@ def subjects(request: DataRequest) -> tuple[str, ...]:
     return tuple(found)
 
 
-def load(subject: str, request: DataRequest) -> SubjectData:
+def load(subject: str, request: Request) -> SubjectData:
     """Read one subject.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from snarfcli.datasets import dfaust
 from snarfcli.datasets.amass_files import amass_sequences, find_sequences, papers_split, read_amass_subject
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import same_split
 from snarfcli.datasets.subjects import SubjectData, body_template
 from snarfcli.errors import UserError
@@ -14,7 +14,7 @@ __all__ = ["load", "subjects"]
 subjects = dfaust.subjects
 
 
-def load(subject: str, request: DataRequest) -> SubjectData:
+def load(subject: str, request: Request) -> SubjectData:
     """Return PosePrior's sequences on the body of one DFaust subject, all out of distribution.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from snarfcli.datasets import amass, builtin, cape, clothed, dfaust, meshes, poseprior, stick2d
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError, nearest
 
@@ -15,7 +15,7 @@ __all__ = ["DataSet", "find_dataset"]
 class DataSet(Protocol):
     """Interface that each module for one data set implements."""
 
-    def subjects(self, request: DataRequest) -> tuple[str, ...]:
+    def subjects(self, request: Request) -> tuple[str, ...]:
         """Return the ids of the available subjects.
 
         Raises:
@@ -23,7 +23,7 @@ class DataSet(Protocol):
         """
         ...
 
-    def load(self, subject: str, request: DataRequest) -> SubjectData:
+    def load(self, subject: str, request: Request) -> SubjectData:
         """Return the data of one subject.
 
         Raises:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.datasets.posed_meshes import RigMeshes
-from snarfcli.datasets.request import DataRequest
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import Split
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.errors import UserError, nearest
@@ -41,12 +41,12 @@ _FRAME_RATE = 30.0  # arbitrary, since the frames have no order in time
 _LOWER, _UPPER, _OBJECT = 1, 2, 4  # indices of joints
 
 
-def subjects(request: DataRequest) -> tuple[str, ...]:
+def subjects(request: Request) -> tuple[str, ...]:
     """Return the names of the sticks, `STICK_SUBJECTS`."""
     return STICK_SUBJECTS
 
 
-def load(subject: str, request: DataRequest) -> SubjectData:
+def load(subject: str, request: Request) -> SubjectData:
     """Return one of the sticks.
 
     Raises:

@@ -11,8 +11,8 @@ from typing import Any
 
 from snarfcli.checks import alternatives, check_choice
 from snarfcli.datasets.registry import find_dataset
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.hydra_config.schema import group_options
@@ -203,7 +203,7 @@ def _check_subjects(
     experiment: Experiment, data: str, subjects: Sequence[str], options: ExperimentOptions, config: dict[str, Any]
 ) -> None:
     """Check that every subject has samples, or meshes to make them from."""
-    request = DataRequest(DataConfig(**config), Path(options.data_root))
+    request = Request(DataConfig(**config), Path(options.data_root))
     missing = [one for one in subjects if not (samples_folder(options.data_root, data, one) / "manifest.json").exists()]
     if subjects and not missing:
         return

@@ -19,8 +19,8 @@ from toy_subject import toy_body, toy_subject
 from snarfcli.commands import preprocess
 from snarfcli.commands.preprocess import PreprocessConfig
 from snarfcli.datasets.posed_meshes import FileMeshes
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
 from snarfcli.formats.surfaces import read_surface
@@ -34,7 +34,7 @@ def subject(monkeypatch: pytest.MonkeyPatch) -> list[SubjectData]:
     """Make the toy the only subject; a test can replace it."""
     holder = [toy_subject()]
 
-    def load(name: str, request: DataRequest) -> SubjectData:
+    def load(name: str, request: Request) -> SubjectData:
         if name != "toy":
             raise UserError(f"no built-in subject '{name}'")
         return holder[0]

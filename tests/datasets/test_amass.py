@@ -12,15 +12,15 @@ from licensed_files import BETAS, amass_poses, write_body, write_new, write_old
 from snarfcli.bodies import builtin_body
 from snarfcli.cli.main import main
 from snarfcli.datasets.registry import find_dataset
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
 
 
-def request(folder: Path | None, root: Path, body: Path | None = None, **config: object) -> DataRequest:
+def request(folder: Path | None, root: Path, body: Path | None = None, **config: object) -> Request:
     folder_name = None if folder is None else str(folder)
-    return DataRequest(DataConfig("amass", 1, 1, 1, folder=folder_name, **config), root, None if body is None else str(body))
+    return Request(DataConfig("amass", 1, 1, 1, folder=folder_name, **config), root, None if body is None else str(body))
 
 
 def load(folder: Path, subject: str | None = None, **settings: object) -> SubjectData:

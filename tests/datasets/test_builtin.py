@@ -11,8 +11,8 @@ from licensed_files import write_body
 
 from snarfcli.bodies import builtin_body
 from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, HELD_OUT_SEQUENCES, builtin_subject, load
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 
@@ -98,10 +98,10 @@ def test_unknown_subject():
 def test_a_body_of_ones_own(tmp_path):
     """The built-in motions on an SMPL body: found under the name it is downloaded with, and named."""
     path = write_body(tmp_path / "smpl" / "models").rename(tmp_path / "smpl" / "models" / "SMPL_NEUTRAL.npz")
-    request = DataRequest(DataConfig("builtin", 1, 1, 1), tmp_path, body=str(tmp_path / "smpl"))
+    request = Request(DataConfig("builtin", 1, 1, 1), tmp_path, body=str(tmp_path / "smpl"))
     own, first = load("50004", request), builtin_subject("50004")
     assert own.sources[0] == f"body {path}"
     assert own.data == "builtin"
     np.testing.assert_allclose(own.template.vertices, first.template.vertices, atol=1e-6)
     with pytest.raises(UserError, match="neutral"):
-        load("50004", DataRequest(request.config, tmp_path, body=str(write_body(tmp_path / "other").parent)))
+        load("50004", Request(request.config, tmp_path, body=str(write_body(tmp_path / "other").parent)))

@@ -12,8 +12,8 @@ from licensed_files import write_body, write_cape
 
 from snarfcli.bodies import load_body
 from snarfcli.datasets.registry import find_dataset
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import split_sequences
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
@@ -24,7 +24,7 @@ from snarfcli.sampling import SamplingSettings
 
 def load(root: Path, subject: str = "00032_longshort", **config: object) -> SubjectData:
     """Load one subject as the command does, every second frame."""
-    return find_dataset("cape").load(subject, DataRequest(DataConfig("cape", 2, 2, 2, **config), root))
+    return find_dataset("cape").load(subject, Request(DataConfig("cape", 2, 2, 2, **config), root))
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def test_meshes_fit_the_bones(root: Path) -> None:
     assert np.abs(vertices - posed.vertices[0].numpy()).max() < 1e-5  # float32 vertices of 1 m, moved there and back
     # the joints are the minimal body's, which is 2 % smaller
     torch.testing.assert_close(subject.skeleton.joints_rest, 0.98 * body.shaped()[1], rtol=1e-5, atol=1e-5)
-    assert find_dataset("cape").subjects(DataRequest(DataConfig("cape", 2, 2, 2), root)) == (
+    assert find_dataset("cape").subjects(Request(DataConfig("cape", 2, 2, 2), root)) == (
         "00032_blazerlong",
         "00032_longshort",
     )

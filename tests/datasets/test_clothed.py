@@ -18,8 +18,8 @@ from snarfcli.datasets.builtin import BUILTIN_SUBJECTS, builtin_subject
 from snarfcli.datasets.clothed import clothed_subject, load, outfit_of, subjects
 from snarfcli.datasets.posed_meshes import ArrayMeshes
 from snarfcli.datasets.registry import find_dataset
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError
 from snarfcli.sampling import check_mesh, occupancies
 
@@ -190,10 +190,10 @@ def test_everybody_has_clothes_of_their_own():
 
 def test_a_body_of_ones_own_and_an_unknown_subject(tmp_path):
     path = write_body(tmp_path / "smpl" / "models").rename(tmp_path / "smpl" / "models" / "SMPL_NEUTRAL.npz")
-    request = DataRequest(DataConfig("clothed", 1, 1, 1), tmp_path, body=str(tmp_path / "smpl"))
+    request = Request(DataConfig("clothed", 1, 1, 1), tmp_path, body=str(tmp_path / "smpl"))
     own = load("50004", request)
     assert own.sources[0] == f"body {path}"
     assert "long sleeves, short trousers" in own.sources[-1]
     assert own.sequences[0].meshes.clothed.body.num_joints == builtin_body().num_joints
     with pytest.raises(UserError, match="no built-in subject '50003'"):
-        load("50003", DataRequest(request.config, tmp_path))
+        load("50003", Request(request.config, tmp_path))

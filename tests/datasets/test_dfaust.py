@@ -12,8 +12,8 @@ from licensed_files import BETAS, amass_poses, write_body, write_dfaust, write_n
 from snarfcli.cli.main import main
 from snarfcli.datasets.amass_files import papers_split
 from snarfcli.datasets.registry import find_dataset
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
 from snarfcli.motions import read_motion
@@ -21,7 +21,7 @@ from snarfcli.motions import read_motion
 
 def load(root: Path, data: str = "dfaust", subject: str = "50002", **config: object) -> SubjectData:
     """Load one subject as the command does."""
-    return find_dataset(data).load(subject, DataRequest(DataConfig(data, 1, 1, 10, **config), root))
+    return find_dataset(data).load(subject, Request(DataConfig(data, 1, 1, 10, **config), root))
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_files_of_other_archives_are_not_taken(old: Path, tmp_path: Path) -> Non
         write_old(tmp_path / folder / "50002" / "jumping_jacks_poses.npz", amass_poses("knees"))
     write_old(tmp_path / "MPI_mosh" / "50009" / "jumping_jacks_poses.npz", amass_poses("knees"))
     assert_same(load(tmp_path), load(old), 0.0)
-    assert find_dataset("dfaust").subjects(DataRequest(DataConfig("dfaust", 1, 1, 10), tmp_path)) == ("50002",)
+    assert find_dataset("dfaust").subjects(Request(DataConfig("dfaust", 1, 1, 10), tmp_path)) == ("50002",)
     (tmp_path / "archives/DFaust67/DFaust_67/50002/50002_jumping_jacks_poses.npz").unlink()
     assert [name for name, _ in load(tmp_path).broken] == ["jumping_jacks"]
 
@@ -128,7 +128,7 @@ def test_poseprior_alone(old: Path) -> None:
     np.testing.assert_array_equal(prior.betas, dfaust.betas)
     for mine, theirs in zip(prior.sequences, dfaust.of_split("ood"), strict=True):
         np.testing.assert_array_equal(mine.motion.poses, theirs.motion.poses)
-    assert find_dataset("poseprior").subjects(DataRequest(DataConfig("poseprior", 1, 1, 10), old)) == ("50002",)
+    assert find_dataset("poseprior").subjects(Request(DataConfig("poseprior", 1, 1, 10), old)) == ("50002",)
 
 
 @pytest.mark.parametrize("data", ["dfaust", "poseprior"])

@@ -15,8 +15,8 @@ from toy_animal_files import animal_glb, write_animal_bvh, write_animal_meshes, 
 
 from snarfcli.datasets import meshes
 from snarfcli.datasets.recorded_sequence import FileToWorld
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
 from snarfcli.samples.preprocessing import preprocess_subject
@@ -33,8 +33,8 @@ def motions(*names: str) -> list[AnimalMotion]:
     return [animal_motion(name, FRAMES) for name in names or ANIMAL_CLIPS]
 
 
-def request(folder: Path, **settings) -> DataRequest:
-    return DataRequest(DataConfig("meshes", 1, 1, 1, folder=str(folder), **settings), Path("nowhere"))
+def request(folder: Path, **settings) -> Request:
+    return Request(DataConfig("meshes", 1, 1, 1, folder=str(folder), **settings), Path("nowhere"))
 
 
 def transforms_of(animal: Animal, motion: AnimalMotion) -> np.ndarray:

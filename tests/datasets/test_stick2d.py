@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial import Delaunay, cKDTree
 
 from snarfcli.datasets.registry import find_dataset
-from snarfcli.datasets.request import DataRequest
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.datasets.stick2d import STICK_STEPS_DEG, STICK_SUBJECTS, stick_subject, stick_weights
 from snarfcli.errors import UserError
 from snarfcli.models.extent import bone_segments
@@ -217,9 +217,9 @@ def test_other_subjects_keep_their_settings(tmp_path: Path) -> None:
 
 def test_unknown_sticks_and_bodies_are_refused() -> None:
     source = find_dataset("stick2d")
-    request = DataRequest(DataConfig(name="stick2d"), Path("data"))
+    request = Request(DataConfig(name="stick2d"), Path("data"))
     assert source.subjects(request) == STICK_SUBJECTS
     with pytest.raises(UserError, match="did you mean 'stick_object'"):
         source.load("stick_objct", request)
     with pytest.raises(UserError, match="leave out body="):
-        source.load("stick", DataRequest(DataConfig(name="stick2d"), Path("data"), "body.npz"))
+        source.load("stick", Request(DataConfig(name="stick2d"), Path("data"), "body.npz"))

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from snarfcli.datasets.settings import DataConfig
 
-__all__ = ["DataRequest"]
+__all__ = ["Request"]
 
 
 @dataclass(frozen=True)
-class DataRequest:
+class Request:
     """Which data to load, and from which folders."""
 
     config: DataConfig

@@ -45,17 +45,17 @@ def _biped(folder: Path) -> Path:
 
 
 def _partial(folder: Path) -> Path:
-    """A rig without toes, fingers and the middle of the spine, as motion-capture suits have."""
+    """A rig without toes and without the middle of the spine, as motion-capture suits have."""
     motion = _motion("running_on_spot", 2)
     rig = rig_of(motion.poses, motion.translation, CMU_NAMES, scale=100)
-    left_out = ("l_hand", "r_hand", "l_foot", "r_foot", "spine2")
+    left_out = ("l_foot", "r_foot", "spine2")
     keep = [joint for joint, name in enumerate(SMPL_JOINT_NAMES) if name not in left_out]
     parents = [rig.parents[joint] for joint in keep]
     parents = [rig.parents[parent] if parent >= 0 and parent not in keep else parent for parent in parents]
     clip = replace(rig.clips[0], world_from_joint=rig.clips[0].world_from_joint[:, keep])
     indices = tuple(keep.index(parent) if parent >= 0 else -1 for parent in parents)
     part = replace(rig, names=tuple(rig.names[joint] for joint in keep), parents=indices, rest=rig.rest[keep], clips=(clip,))
-    return write_bvh(folder / "partial.bvh", part, "XYZ", end=(0.0, -1.0, 0.5))
+    return write_bvh(folder / "partial.bvh", part, "XYZ")
 
 
 def _gltf(folder: Path) -> Path:
@@ -67,6 +67,7 @@ def _gltf(folder: Path) -> Path:
     for joint, parent in enumerate(rig.parents):
         if parent >= 0:
             children[parent].append(joint)
+    rest = np.diag([0.01, 0.01, 0.01, 1.0]) @ rig.rest
     times = builder.array(np.arange(motion.num_frames) / 10.0)
     posed = rig.clips[0].world_from_joint
     nodes, channels, samplers = [], [], []
@@ -86,7 +87,12 @@ def _gltf(folder: Path) -> Path:
         scenes=[{"nodes": [len(rig.names)]}],
         scene=0,
         nodes=nodes,
-        skins=[{"joints": list(range(len(rig.names)))}],
+        skins=[
+            {
+                "joints": list(range(len(rig.names))),
+                "inverseBindMatrices": builder.array(np.linalg.inv(rest)),
+            }
+        ],
         animations=[{"name": "walk", "channels": channels, "samplers": samplers}],
     )
     path = folder / "mixamo.glb"

@@ -24,6 +24,8 @@ _DEFAULT_FRAME_RATE = 60.0
 # World transforms take 128 bytes per joint and frame: 256 MiB for ten minutes of 30 joints at 120 frames per second.
 _MAX_JOINT_FRAMES = 2**21
 _FRAMES = re.compile(r"frames\s*:?\s*(\S*)", re.IGNORECASE)
+_NO_POSITIONS = 0.05  # positions of joints that are all smaller than this share of the OFFSETs are relative to them
+_OTHER_SIZE = 1.25  # bones at rest and in motion that differ by this factor in total length
 _FRAME_TIME = re.compile(r"frame\s*time\s*:?\s*(\S*)", re.IGNORECASE)
 
 
@@ -31,9 +33,11 @@ def read_bvh(path: str | Path) -> Rig:
     """Read the joints and the motion of a BVH file.
 
     The reader accepts any names, white space, line ends and letter case. Channels may come in any order, and any joint may have
-    position channels; a position replaces the joint's OFFSET. An End Site becomes a joint `<parent>_end` that never rotates; it
-    gives the direction of the last bone. Names that occur twice get a number. A missing frame time, or 0, means 60 frames per
-    second. All complete frames are read, even if the declared number differs; an incomplete last frame is left out.
+    position channels; a position replaces the joint's OFFSET, unless all are near zero, which means that they are added to it.
+    Where OFFSETs are zero, or of another size than the positions, the rest pose has the median positions instead. An End Site
+    becomes a joint `<parent>_end` that never rotates; it gives the direction of the last bone. Names that occur twice get a
+    number. A missing frame time, or 0, means 60 frames per second. All complete frames are read, even if the declared number
+    differs; an incomplete last frame is left out.
 
     Args:
         path: the file.
@@ -55,6 +59,7 @@ def read_bvh(path: str | Path) -> Rig:
             lines = BvhLines(file, path)
             joints = read_hierarchy(lines)
             values, frame_rate = _read_motion(lines, joints)
+            _reconcile_positions(joints, values, path)
     except OSError as error:
         raise UserError(f"BVH file {path} cannot be read ({error.strerror or error})") from None
     with np.errstate(over="ignore", invalid="ignore"):
@@ -121,6 +126,38 @@ def _read_frame_rate(lines: BvhLines, word: str) -> float:
     # Files round the frame time: 120 frames per second are written as 0.008333 or 0.0083333.
     rate = 1 / seconds
     return float(round(rate)) if abs(rate - round(rate)) < 2e-4 * rate and rate >= 1 else rate
+
+
+def _reconcile_positions(joints: list[BvhJoint], values: NDArray[np.float64], path: Path) -> None:
+    """Make OFFSETs and position channels of joints below the root agree, in place, if their sizes differ.
+
+    Args:
+        joints: J joints.
+        values: [T, channels], values of all channels, units of the file.
+        path: the file, for messages.
+    """
+    columns: dict[int, list[int]] = {}  # of the x, y and z position per joint that has all three
+    start = 0
+    for index, joint in enumerate(joints):
+        places = [start + joint.channels.index((axis, "position")) for axis in "xyz" if (axis, "position") in joint.channels]
+        if len(places) == 3 and joint.parent >= 0:
+            columns[index] = places
+        start += len(joint.channels)
+    if not columns or not len(values):
+        return
+    offsets = np.stack([joints[index].offset for index in columns])
+    with np.errstate(over="ignore", invalid="ignore"):
+        medians = np.median(values[:, list(columns.values())], axis=0)
+        sizes, posed = np.linalg.norm(offsets, axis=1), np.linalg.norm(medians, axis=1)
+        if posed.sum() < _NO_POSITIONS * sizes.sum():
+            log.info("%s: the positions of joints are near zero and were added to their OFFSETs", path.name)
+            for columns_of_joint, offset in zip(columns.values(), offsets, strict=True):
+                values[:, columns_of_joint] += offset
+            return
+        is_other = (sizes == 0) | (not 1 / _OTHER_SIZE < sizes.sum() / max(posed.sum(), 1e-300) < _OTHER_SIZE)
+    for index, median, other in zip(columns, medians, is_other, strict=True):
+        if other:
+            joints[index].offset = median
 
 
 def _rest_transforms(joints: list[BvhJoint]) -> NDArray[np.float64]:

@@ -22,11 +22,13 @@ from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.errors import UserError, nearest
 from snarfcli.formats.rig import Rig, RigClip
+from snarfcli.motions.clip_turns import clip_turns, doubtful_limbs, false_toes
 from snarfcli.motions.joint_names import find_body_parts
 from snarfcli.motions.layouts import layout_of
 from snarfcli.motions.mapping import map_joints
 from snarfcli.motions.motion import Motion
-from snarfcli.motions.rest_poses import RestMatch, rest_turns
+from snarfcli.motions.rest_match import RestMatch
+from snarfcli.motions.rest_poses import rest_turns
 from snarfcli.motions.up_axis import Up, up_axis, y_from_z_up
 
 __all__ = ["choose_clip", "retarget"]
@@ -37,6 +39,7 @@ Array = NDArray[np.float64]
 
 _LEGS = (("l_hip", "l_knee"), ("l_knee", "l_ankle"), ("r_hip", "r_knee"), ("r_knee", "r_ankle"))
 _MAX_DISTANCE_M = 1e6
+_STRETCH = 0.2  # maximum relative difference between the lengths of bones at rest and in the clip
 _SAME_SKELETON_M = 1e-3  # maximum difference of joint positions, relative to their parents, in two files of one skeleton
 
 
@@ -108,19 +111,41 @@ def retarget(
     match = RestMatch(pairs, parts.joints, parts.spine, joints_rest, rig.rest[:, :3, 3], skeleton.parents, rig.parents)
     if not np.isfinite(rig.rest).all():
         raise UserError(f"{path} has NaN or infinity in its rest pose; export it again")
-    turns = rest_turns(match)
-    root = Rotation.from_matrix(_turned(rig, clip, pairs[0], path) @ turns[0])
-    axis = _up(root, turns[0]) if up == "auto" else up
+    turned = {joint: _turned(rig, clip, number, path) for joint, number in pairs.items()}
+    turns = _turns(match, turned, clip.world_from_joint[..., :3, 3], path)
+    axis = _up(Rotation.from_matrix(turned[0] @ turns[0]), turns[0]) if up == "auto" else up
     if up == "auto" and axis == "z":
         log.info("%s: z is up in this file and was turned to y", path.name)
     upright = y_from_z_up().as_matrix() if axis == "z" else np.eye(3)
 
-    rotations = {joint: upright @ _turned(rig, clip, number, path) @ turns[joint] for joint, number in pairs.items()}
+    rotations = {joint: upright @ turned[joint] @ turns[joint] for joint in pairs}
     poses = _local_poses(rotations, skeleton.parents, len(clip.world_from_joint))
     translation = _translation(match, clip, rotations[0], upright)
     if not np.abs(translation).max() < _MAX_DISTANCE_M:
         raise UserError(f"{path}: the body moves over {_MAX_DISTANCE_M / 1000:g} km away; check the track of its root")
     return Motion(name, poses, translation, clip.frame_rate)
+
+
+def _turns(match: RestMatch, turned: Mapping[int, Array], posed: Array, path: Path) -> dict[int, Array]:
+    """Return the rotation [3, 3] per paired joint from the rest pose of the skeleton to that of the rig.
+
+    Args:
+        match: the paired joints at rest.
+        turned: [T, 3, 3] per paired joint, world rotations of the rig's joints relative to their rest.
+        posed: [T, K, 3], places of the rig's joints.
+        path: file of the rig, for messages.
+    """
+    turns = rest_turns(match, without_bone=false_toes(match, posed))
+    doubtful = doubtful_limbs(match)
+    if doubtful:
+        log.info(
+            "%s: the rest pose is not that of a standing person (%s), so rotations are relative to the frames of the clip;"
+            " rest=file takes the rest pose of the file, rest=NUMBER the frame of that number",
+            path.name,
+            ", ".join(name.replace("l_", "left ").replace("r_", "right ") for name in doubtful),
+        )
+        turns |= clip_turns(match, doubtful, turns, turned, posed)
+    return turns
 
 
 def _local_poses(rotations: Mapping[int, Array], parents: Sequence[int], frames: int) -> Array:
@@ -216,26 +241,29 @@ def _translation(match: RestMatch, clip: RigClip, root_world: Array, upright: Ar
     hips = hips if len(hips) == 2 else [0]
     place = clip.world_from_joint[..., :3, 3][:, [match.pairs[joint] for joint in hips]].mean(1)
     with np.errstate(over="ignore", invalid="ignore"):
-        place = _scale(match) * place @ upright.T
+        place = _scale(match, clip.world_from_joint[..., :3, 3]) * place @ upright.T
     root = match.target[0]
     return place - root_world @ (match.target[hips].mean(0) - root) - root
 
 
-@np.errstate(over="ignore", invalid="ignore")
-def _scale(match: RestMatch) -> float:
-    """Return the metres per unit of the rig, from the length of the legs, or of all bones."""
-    bones = []
-    for upper, lower in _LEGS:
-        start, end = match.both(upper), match.both(lower)
-        if start is not None and end is not None:
-            bones.append((np.linalg.norm(start[0] - end[0]), np.linalg.norm(start[1] - end[1])))
-    if len(bones) < len(_LEGS):
-        bones = [
-            (
-                np.linalg.norm(match.target[joint] - match.target[other]),
-                np.linalg.norm(match.source[match.pairs[joint]] - match.source[match.pairs[other]]),
-            )
-            for joint, other in match.above.items()
-        ]
-    target, source = (sum(bone[side] for bone in bones) for side in (0, 1))
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def _scale(match: RestMatch, posed: Array) -> float:
+    """Return the metres per unit of the rig, from the length of the legs, or of all bones.
+
+    Args:
+        match: the paired joints at rest.
+        posed: [T, K, 3], places of the rig's joints. Their distances count where the rest pose has others, as in files whose
+            bones have no length at rest, or are at rest in other units.
+    """
+    bones = [(match.parts.get(upper, -1), match.parts.get(lower, -1)) for upper, lower in _LEGS]
+    if not all(joint in match.pairs for bone in bones for joint in bone):
+        bones = [(above, joint) for joint, above in match.above.items()]
+    if not bones:
+        return 1.0
+    above, below = np.array(bones).T
+    upper, lower = ([match.pairs[joint] for joint in joints] for joints in (above, below))
+    target = np.linalg.norm(match.target[below] - match.target[above], axis=1).sum()
+    rest = np.linalg.norm(match.source[lower] - match.source[upper], axis=1).sum()
+    moving = np.median(np.linalg.norm(posed[:, lower] - posed[:, upper], axis=2).sum(1))
+    source = rest if abs(rest - moving) < _STRETCH * moving else moving
     return float(target / source) if source > 0 and np.isfinite(source) and target > 0 else 1.0

@@ -165,6 +165,39 @@ def test_what_is_odd_is_noted(tmp_path, caplog):
     assert "the last frame is incomplete and was left out" in caplog.text
 
 
+_POSITIONED = """HIERARCHY
+ROOT hips {{ OFFSET 0 0 0 CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+JOINT knee {{ OFFSET {knee} CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+JOINT foot {{ OFFSET {foot} CHANNELS 3 Xposition Yposition Zposition End Site {{ OFFSET 0 0 2 }} }} }} }}
+MOTION
+Frames: 3
+Frame Time: 0.1
+"""
+
+
+def positioned(tmp_path, knee, foot, at_knee, at_foot):
+    frames = "".join(f"5 {frame} 0 0 0 0 {at_knee} 90 0 0 {at_foot}\n" for frame in range(3))
+    return read_bvh(write(tmp_path, _POSITIONED.format(knee=knee, foot=foot) + frames))
+
+
+@pytest.mark.parametrize(
+    ("knee", "foot"), [("0 -4 0", "0 -3 0"), ("0 0 0", "0 0 0"), ("0 -4 0", "0 0 0"), ("0 -0.04 0", "0 -0.03 0")]
+)
+def test_positions_tell_the_rest_pose_where_offsets_do_not(tmp_path, knee, foot):
+    rig = positioned(tmp_path, knee, foot, "0 -4 0", "0 -3 0")
+    np.testing.assert_allclose(rig.rest[:3, :3, 3], [[0, 0, 0], [0, -4, 0], [0, -7, 0]], atol=1e-12)
+    # the knee is turned by 90 degrees about z, so the foot is beside it
+    np.testing.assert_allclose(rig.clips[0].world_from_joint[1, :3, :3, 3], [[5, 1, 0], [5, -3, 0], [8, -3, 0]], atol=1e-12)
+
+
+def test_positions_near_zero_are_added_to_the_offsets(tmp_path, caplog):
+    with caplog.at_level(logging.INFO, "snarfcli"):
+        rig = positioned(tmp_path, "0 -4 0", "0 -3 0", "0 0.1 0", "0 0 0")
+    assert "near zero and were added to their OFFSETs" in caplog.text
+    np.testing.assert_allclose(rig.rest[:3, :3, 3], [[0, 0, 0], [0, -4, 0], [0, -7, 0]], atol=1e-12)
+    np.testing.assert_allclose(rig.clips[0].world_from_joint[1, 1:3, :3, 3], [[5, -2.9, 0], [8, -2.9, 0]], atol=1e-12)
+
+
 def test_joints_without_motion(tmp_path):
     assert read_bvh(write(tmp_path, ARM)).clips == ()
     assert read_bvh(write(tmp_path, ARM.split("MOTION")[0])).clips == ()

@@ -1,0 +1,240 @@
+"""Limbs whose rest pose is not that of a standing person: find their rotations from the frames of a clip instead.
+
+Many rigs rest with all bones along one axis, whole or limb by limb (motion-capture suits, game engines, research data). Such a
+rest pose tells nothing about how a bone is twisted about itself. The posed frames do: on average a limb is not twisted against
+the trunk, and knees and elbows bend about their hinges.
+
+Let R_S be the world rotation of a joint of the rig relative to its rest. For every frame an expected world rotation E of the
+joint of the skeleton is made from places alone: the smallest rotation of its parent that points the bone as in the frame. All
+estimates inv(R_S) E of one bone agree in its direction; their weighted mean tells the twist. Frames in which the bone is near
+its rest direction weigh most, since there the smallest rotation is most reliable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from snarfcli.bodies.kinematics import nearest_rotation
+from snarfcli.motions.rest_match import LIMB_ROOTS, RestMatch, body_frame, frame_of, smallest_turn, unit
+
+__all__ = ["clip_turns", "doubtful_limbs", "false_toes"]
+
+Array = NDArray[np.float64]
+
+_MAX_FRAMES = 300  # that are looked at, spread over the clip
+_COS_60, _COS_45 = 0.5, np.sqrt(0.5)
+_NEAR_RAD = np.radians(20)  # in frames within this angle of its rest direction, the twist of a bone is reliable
+_BENT_SINE = np.sin(np.radians(20))  # a knee or elbow that is bent more tells the direction of its hinge
+_TOES_COS = np.cos(np.radians(35))
+
+
+def doubtful_limbs(match: RestMatch) -> list[str]:
+    """Return which parts of a human rig do not rest as in a standing person: "trunk", names of `LIMB_ROOTS`, or nothing.
+
+    Legs must point down; arms may hang, or be raised sideways up to 45 degrees above the horizontal. A limb is doubtful with
+    its opposite one. If the trunk is doubtful, the limbs cannot be judged, so that all are.
+    """
+    if body_frame(match.points(0)) is None:
+        return []
+    points = match.points(1)
+    frame = body_frame(points)
+    limbs = [name for name in LIMB_ROOTS if match.limb(name)]
+    if frame is None or not _trunk_stands(match, points, frame[:, 1]):
+        return ["trunk", *limbs]
+    doubtful = []
+    for kind, is_fine in (("arm", _arms_rest), ("leg", _legs_rest)):
+        names = [name for name in limbs if name.endswith(kind)]
+        if not is_fine(points, frame):
+            doubtful += names
+    return doubtful
+
+
+def _trunk_stands(match: RestMatch, points: Mapping[str, Array], up: Array) -> bool:
+    """Whether hips lie beside each other, and all bones from hips to neck point up within 60 degrees."""
+    top = points.get("neck", points.get("head"))
+    chain = [(points["l_hip"] + points["r_hip"]) / 2, *(match.source[match.pairs[j]] for j in match.spine if j in match.pairs)]
+    if top is not None:
+        chain.append(top)
+    places = np.stack(chain)
+    bones = places[1:] - places[:-1]
+    lengths = np.linalg.norm(bones, axis=1)
+    hips = points["l_hip"] - points["r_hip"]
+    if not abs(hips @ up) <= _COS_45 * np.linalg.norm(hips) or not np.linalg.norm(hips) > 0.02 * lengths.sum():
+        return False
+    return bool((bones @ up > _COS_60 * lengths)[lengths > 0.1 * lengths.sum()].all())
+
+
+def _legs_rest(points: Mapping[str, Array], frame: Array) -> bool:
+    """Whether the bones of both legs point down within 60 degrees."""
+    bones = (("hip", "knee"), ("knee", "ankle"))
+    directions = [direction for side in "lr" for direction in _directions(points, side, bones)]
+    return all(-(direction @ frame[:, 1]) > _COS_60 for direction in directions)
+
+
+def _arms_rest(points: Mapping[str, Array], frame: Array) -> bool:
+    """Whether the upper arms hang, or point sideways to their own side, and the elbows are bent by less than a right angle."""
+    for side, sign in (("l", 1), ("r", -1)):
+        directions = _directions(points, side, (("shoulder", "elbow"), ("elbow", "wrist")))
+        if not directions:
+            continue
+        left, up, forward = directions[0] @ frame
+        if up > _COS_45 or sign * left < -_COS_60 or abs(forward) > _COS_45:
+            return False
+        if len(directions) == 2 and directions[0] @ directions[1] < 0:
+            return False
+    return True
+
+
+def _directions(points: Mapping[str, Array], side: str, bones: Collection[tuple[str, str]]) -> list[Array]:
+    named = [(f"{side}_{upper}", f"{side}_{lower}") for upper, lower in bones]
+    directions = [unit(points[lower] - points[upper]) for upper, lower in named if upper in points and lower in points]
+    return [direction for direction in directions if np.isfinite(direction).all()]
+
+
+def false_toes(match: RestMatch, posed: Array) -> set[int]:
+    """Return the ankles of the skeleton whose toes in the rig are none: joints that stay below the ankle, as soles do.
+
+    Args:
+        match: the paired joints at rest.
+        posed: [T, K, 3], places of the joints of the rig in the frames of a clip.
+    """
+    ankles = set()
+    for side in "lr":
+        joints = [match.parts.get(f"{side}_{part}", -1) for part in ("knee", "ankle", "foot")]
+        if not all(joint in match.pairs for joint in joints):
+            continue
+        knee, ankle, toe = (_some(posed[:, match.pairs[joint]]) for joint in joints)
+        cosine = (unit(ankle - knee) * unit(toe - ankle)).sum(-1)
+        if np.median(cosine) > _TOES_COS:
+            ankles.add(joints[1])
+    return ankles
+
+
+def clip_turns(
+    match: RestMatch,
+    doubtful: Collection[str],
+    turns: Mapping[int, Array],
+    rotations: Mapping[int, Array],
+    posed: Array,
+) -> dict[int, Array]:
+    """Return the rotations from the rest pose of the skeleton to that of the rig, for the joints of doubtful limbs.
+
+    Args:
+        match: the paired joints at rest.
+        doubtful: as from `doubtful_limbs`.
+        turns: [3, 3] per paired joint, as from `rest_turns`; used for the joints that are not in doubt.
+        rotations: [T, 3, 3] per paired joint of the skeleton, world rotations of the rig's joint relative to its rest, T > 0.
+        posed: [T, K, 3], places of the joints of the rig.
+
+    Returns:
+        [3, 3] per paired joint of the doubtful limbs.
+    """
+    limbs = {joint for name in doubtful if name in LIMB_ROOTS for joint in match.limb(name)}
+    joints = set(match.pairs) if "trunk" in doubtful else limbs
+    rotations = {joint: _some(rotations[joint]) for joint in match.pairs}
+    frames = _Frames(match, _some(posed))
+    found: dict[int, Array] = {}
+    for joint in match.pairs:
+        if joint not in joints:
+            continue
+        above = match.above.get(joint)
+        parent = None if above is None else rotations[above] @ (found[above] if above in found else turns[above])
+        expected, weights = frames.expected(joint, parent)
+        estimates = rotations[joint].transpose(0, 2, 1) @ expected
+        mean = np.tensordot(weights / weights.sum(), estimates, 1)
+        found[joint] = nearest_rotation(torch.from_numpy(mean)).numpy()
+    return found
+
+
+def _some(frames: Array) -> Array:
+    """Return at most `_MAX_FRAMES` of T frames, spread evenly."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, _MAX_FRAMES).round().astype(int))
+    return frames[chosen]
+
+
+class _Frames:
+    """Expected world rotations of the skeleton's joints in the frames of a clip, from the places of the rig's joints."""
+
+    def __init__(self, match: RestMatch, posed: Array) -> None:
+        self.match, self.posed = match, posed
+        rest = body_frame(match.points(0))
+        assert rest is not None  # else no limb is doubtful
+        self.rest_frame = rest
+
+    def expected(self, joint: int, parent: Array | None) -> tuple[Array, Array]:
+        """Return the rotations [T, 3, 3] of a joint and the weight [T] of each, for its parent's rotations [T, 3, 3]."""
+        match, part = self.match, self.match.names.get(joint, "")
+        is_chest = bool(match.spine) and joint == match.spine[-1]
+        if parent is None or part == "pelvis" or is_chest:
+            frame = self._trunk_frame("shoulder" if is_chest else "hip")
+            if frame is not None:
+                return frame, np.ones(len(frame))
+        if parent is None:
+            return np.tile(np.eye(3), (len(self.posed), 1, 1)), np.ones(len(self.posed))
+        bone = self._posed_bone(joint)
+        if bone is None or part[2:] == "collar" or part in ("neck", "head", "jaw"):
+            return parent, np.ones(len(parent))
+        before, after = parent @ bone[0], bone[1]
+        swing = smallest_turn(before, after) @ parent
+        weights = _nearness(np.arccos(np.clip((before * after).sum(-1), -1, 1)))
+        if part[2:] in ("hip", "shoulder") and weights.max() < 1:
+            return self._hinged(part, bone, swing, weights)
+        return swing, weights / weights.max()
+
+    def _posed_bone(self, joint: int) -> tuple[Array, Array] | None:
+        """Return the direction of a bone in the skeleton at rest [3], and in the frames of the rig [T, 3]; None without one."""
+        ends = self.match.bone_ends(joint)
+        if ends is None:
+            return None
+        rest = unit(self.match.target[ends[0]].mean(0) - self.match.target[joint])
+        posed = unit(self.posed[:, ends[1]].mean(1) - self.posed[:, self.match.pairs[joint]])
+        return (rest, posed) if np.isfinite(rest).all() and np.isfinite(posed).all() else None
+
+    def _trunk_frame(self, part: str) -> Array | None:
+        """Return rotations [T, 3, 3] of pelvis or chest from hips or shoulders and the spine; None if unknown."""
+        names = (f"l_{part}", f"r_{part}", "l_hip", "r_hip", "neck" if "neck" in self.match.points(0) else "head")
+        rest, places = self.match.points(0), self.match.names
+        if not all(name in rest for name in names):
+            return None
+        joints = {name: joint for joint, name in places.items()}
+        posed = {name: self.posed[:, self.match.pairs[joints[name]]] for name in names}
+        frames = [
+            frame_of(points[names[0]] - points[names[1]], points[names[4]] - (points["l_hip"] + points["r_hip"]) / 2)
+            for points in (rest, posed)
+        ]
+        turns = frames[1] @ frames[0].T
+        return turns if np.isfinite(turns).all() else None
+
+    def _hinged(self, part: str, bone: tuple[Array, Array], swing: Array, weights: Array) -> tuple[Array, Array]:
+        """Return rotations of thigh or upper arm whose knee or elbow bends about its hinge; `swing` if it never bends."""
+        lower = {"hip": "knee", "shoulder": "elbow"}[part[2:]]
+        joint = self.match.parts.get(f"{part[0]}_{lower}", -1)
+        below = self._posed_bone(joint) if joint in self.match.pairs else None
+        if below is None:
+            return swing, weights
+        hinge = np.cross(bone[1], below[1])  # of the frames; its length is the sine of the bend
+        sine = np.linalg.norm(hinge, axis=-1)
+        bent = sine > _BENT_SINE
+        if not bent.any():
+            return swing, weights
+        forward = self.rest_frame[:, 2] if lower == "elbow" else -self.rest_frame[:, 2]
+        rest = _columns(bone[0], np.cross(bone[0], forward))
+        posed = _columns(bone[1], np.where(bent[:, None], hinge, forward))
+        turns = posed @ rest.T
+        is_good = bent & np.isfinite(turns).all((1, 2))
+        return np.where(is_good[:, None, None], turns, swing), np.where(is_good, sine**2, 0.0)
+
+
+def _nearness(angles: Array) -> Array:
+    """Return weights [T] of frames by the angle of a bone to its rest direction: 1 up to 20 degrees, then falling."""
+    return np.exp(-np.maximum(angles**2 - _NEAR_RAD**2, 0) / (2 * _NEAR_RAD**2)) + 1e-12
+
+
+def _columns(along: Array, across: Array) -> Array:
+    """Return orthonormal frames [..., 3, 3]; the first column is `along` [..., 3], the second close to `across`."""
+    second = unit(across - (along * across).sum(-1, keepdims=True) * along)
+    return np.stack([along, second, np.cross(along, second)], -1)

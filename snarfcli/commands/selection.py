@@ -68,6 +68,8 @@ class MotionSelection:
     """Up axis of the pose file: auto, y or z."""
     hands: str = MISSING
     """SMPL's hand joints if the pose file has fingers: rest (straight), or released (as in the papers' code)."""
+    rest: str = MISSING
+    """For .bvh and .glb: rest pose to compare with the avatar's: auto, file, clip (all frames), or the number of a frame."""
     mapping: str | None = MISSING
     """For .bvh and .glb: JSON file {joint of the avatar: joint of the pose file}; null matches common joint names."""
     clip: str | None = MISSING
@@ -190,7 +192,13 @@ def _read(
     """Return the whole motion, y up, and its bone transforms if joints stretch."""
     if pose is not None:
         motion = read_motion(
-            pose, skeleton, up=cast(Up, choice.up), hands=choice.hands, mapping=choice.mapping, clip=choice.clip
+            pose,
+            skeleton,
+            up=cast(Up, choice.up),
+            hands=choice.hands,
+            rest=choice.rest,
+            mapping=choice.mapping,
+            clip=choice.clip,
         )
         return motion, None
     is_smpl = layout_of(skeleton) == SMPL

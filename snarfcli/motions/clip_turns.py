@@ -6,13 +6,14 @@ the trunk, and knees and elbows bend about their hinges.
 
 Let R_S be the world rotation of a joint of the rig relative to its rest. For every frame an expected world rotation E of the
 joint of the skeleton is made from places alone: the smallest rotation of its parent that points the bone as in the frame. All
-estimates inv(R_S) E of one bone agree in its direction; their weighted mean tells the twist. Frames in which the bone is near
-its rest direction weigh most, since there the smallest rotation is most reliable.
+estimates inv(R_S) E of one bone agree in its direction; their weighted mean tells the twist. For thighs and upper arms, E comes
+from the hinge instead if it is ever seen bent. Else frames in which the bone is near its rest direction weigh most, since there
+the smallest rotation is most reliable.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -21,42 +22,50 @@ from numpy.typing import NDArray
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.motions.rest_match import LIMB_ROOTS, RestMatch, body_frame, frame_of, smallest_turn, unit
 
-__all__ = ["clip_turns", "doubtful_limbs", "false_toes"]
+__all__ = ["all_limbs", "clip_turns", "doubtful_limbs", "false_toes"]
 
 Array = NDArray[np.float64]
 
 _MAX_FRAMES = 300  # that are looked at, spread over the clip
 _COS_60, _COS_45 = 0.5, np.sqrt(0.5)
 _NEAR_RAD = np.radians(20)  # in frames within this angle of its rest direction, the twist of a bone is reliable
-_BENT_SINE = np.sin(np.radians(20))  # a knee or elbow that is bent more tells the direction of its hinge
-_TOES_COS = np.cos(np.radians(35))
+_BENT_SINE = np.sin(np.radians(25))  # a knee or elbow that is bent more tells the direction of its hinge
+_SOLE_COS = np.cos(np.radians(35))  # toes within this angle of the shin's direction are none
+_TOES_BEND_COS = np.cos(np.radians(80))  # End Sites of toes at a larger angle to the foot point anywhere
+
+
+def all_limbs(match: RestMatch) -> list[str]:
+    """Return "trunk" and the names of `LIMB_ROOTS` that a human skeleton and the rig have; nothing for other skeletons."""
+    return [] if body_frame(match.points(0)) is None else ["trunk", *(name for name in LIMB_ROOTS if match.limb(name))]
 
 
 def doubtful_limbs(match: RestMatch) -> list[str]:
-    """Return which parts of a human rig do not rest as in a standing person: "trunk", names of `LIMB_ROOTS`, or nothing.
+    """Return which parts of a human rig do not rest as in a standing person, of `all_limbs`.
 
     Legs must point down; arms may hang, or be raised sideways up to 45 degrees above the horizontal. A limb is doubtful with
-    its opposite one. If the trunk is doubtful, the limbs cannot be judged, so that all are.
+    its opposite one. If the trunk is doubtful, the limbs cannot be judged, so that all are. Nothing is, if
+    the skeleton itself does not rest as a standing person.
     """
-    if body_frame(match.points(0)) is None:
+    limbs = all_limbs(match)
+    if not limbs or _doubtful_kinds(match, 0):
         return []
-    points = match.points(1)
+    kinds = _doubtful_kinds(match, 1)
+    return limbs if "trunk" in kinds else [name for name in limbs if name[2:] in kinds]
+
+
+def _doubtful_kinds(match: RestMatch, side: int) -> list[str]:
+    """Return which of trunk, arm and leg do not rest as in a standing person; `side` is 0 for the skeleton, 1 for the rig."""
+    points = match.points(side)
     frame = body_frame(points)
-    limbs = [name for name in LIMB_ROOTS if match.limb(name)]
-    if frame is None or not _trunk_stands(match, points, frame[:, 1]):
-        return ["trunk", *limbs]
-    doubtful = []
-    for kind, is_fine in (("arm", _arms_rest), ("leg", _legs_rest)):
-        names = [name for name in limbs if name.endswith(kind)]
-        if not is_fine(points, frame):
-            doubtful += names
-    return doubtful
+    if frame is None or not _trunk_stands(points, match.spine_points(side), frame[:, 1]):
+        return ["trunk"]
+    return [kind for kind, is_fine in (("arm", _arms_rest), ("leg", _legs_rest)) if not is_fine(points, frame)]
 
 
-def _trunk_stands(match: RestMatch, points: Mapping[str, Array], up: Array) -> bool:
+def _trunk_stands(points: Mapping[str, Array], spine: Sequence[Array], up: Array) -> bool:
     """Whether hips lie beside each other, and all bones from hips to neck point up within 60 degrees."""
     top = points.get("neck", points.get("head"))
-    chain = [(points["l_hip"] + points["r_hip"]) / 2, *(match.source[match.pairs[j]] for j in match.spine if j in match.pairs)]
+    chain = [(points["l_hip"] + points["r_hip"]) / 2, *spine]
     if top is not None:
         chain.append(top)
     places = np.stack(chain)
@@ -109,7 +118,7 @@ def false_toes(match: RestMatch, posed: Array) -> set[int]:
             continue
         knee, ankle, toe = (_some(posed[:, match.pairs[joint]]) for joint in joints)
         cosine = (unit(ankle - knee) * unit(toe - ankle)).sum(-1)
-        if np.median(cosine) > _TOES_COS:
+        if np.median(cosine) > _SOLE_COS:
             ankles.add(joints[1])
     return ankles
 
@@ -169,29 +178,40 @@ class _Frames:
         """Return the rotations [T, 3, 3] of a joint and the weight [T] of each, for its parent's rotations [T, 3, 3]."""
         match, part = self.match, self.match.names.get(joint, "")
         is_chest = bool(match.spine) and joint == match.spine[-1]
+        even = np.ones(len(self.posed))
         if parent is None or part == "pelvis" or is_chest:
             frame = self._trunk_frame("shoulder" if is_chest else "hip")
             if frame is not None:
-                return frame, np.ones(len(frame))
+                return frame, even
         if parent is None:
-            return np.tile(np.eye(3), (len(self.posed), 1, 1)), np.ones(len(self.posed))
+            return np.tile(np.eye(3), (len(self.posed), 1, 1)), even
         bone = self._posed_bone(joint)
         if bone is None or part[2:] == "collar" or part in ("neck", "head", "jaw"):
-            return parent, np.ones(len(parent))
+            return parent, even
         before, after = parent @ bone[0], bone[1]
         swing = smallest_turn(before, after) @ parent
         weights = _nearness(np.arccos(np.clip((before * after).sum(-1), -1, 1)))
-        if part[2:] in ("hip", "shoulder") and weights.max() < 1:
-            return self._hinged(part, bone, swing, weights)
-        return swing, weights / weights.max()
+        if part[2:] in ("hip", "shoulder"):
+            return self._hinged(part, bone) or (swing, weights)
+        return swing, weights
 
     def _posed_bone(self, joint: int) -> tuple[Array, Array] | None:
         """Return the direction of a bone in the skeleton at rest [3], and in the frames of the rig [T, 3]; None without one."""
-        ends = self.match.bone_ends(joint)
-        if ends is None:
+        match, at = self.match, self.posed[:, self.match.pairs[joint]]
+        ends = match.bone_ends(joint)
+        if ends is not None:
+            rest, posed = unit(match.target[ends[0]].mean(0) - match.target[joint]), unit(self.posed[:, ends[1]].mean(1) - at)
+        elif match.names.get(joint, "")[2:] == "foot":
+            # toes point forwards at rest, and in the rig to their End Site, if that continues the foot
+            tips = [tip for tip, parent in enumerate(match.source_parents) if parent == match.pairs[joint]]
+            if len(tips) != 1 or joint not in match.above:
+                return None
+            rest, posed = self.rest_frame[:, 2], unit(self.posed[:, tips[0]] - at)
+            foot = unit(at - self.posed[:, match.pairs[match.above[joint]]])
+            if not np.median((foot * posed).sum(-1)) > _TOES_BEND_COS:
+                return None
+        else:
             return None
-        rest = unit(self.match.target[ends[0]].mean(0) - self.match.target[joint])
-        posed = unit(self.posed[:, ends[1]].mean(1) - self.posed[:, self.match.pairs[joint]])
         return (rest, posed) if np.isfinite(rest).all() and np.isfinite(posed).all() else None
 
     def _trunk_frame(self, part: str) -> Array | None:
@@ -209,24 +229,22 @@ class _Frames:
         turns = frames[1] @ frames[0].T
         return turns if np.isfinite(turns).all() else None
 
-    def _hinged(self, part: str, bone: tuple[Array, Array], swing: Array, weights: Array) -> tuple[Array, Array]:
-        """Return rotations of thigh or upper arm whose knee or elbow bends about its hinge; `swing` if it never bends."""
+    def _hinged(self, part: str, bone: tuple[Array, Array]) -> tuple[Array, Array] | None:
+        """Return rotations of thigh or upper arm from the hinge of knee or elbow, and weights; None if it never bends."""
         lower = {"hip": "knee", "shoulder": "elbow"}[part[2:]]
         joint = self.match.parts.get(f"{part[0]}_{lower}", -1)
         below = self._posed_bone(joint) if joint in self.match.pairs else None
         if below is None:
-            return swing, weights
-        hinge = np.cross(bone[1], below[1])  # of the frames; its length is the sine of the bend
+            return None
+        hinge = np.cross(bone[1], below[1])  # its length is the sine of the bend
         sine = np.linalg.norm(hinge, axis=-1)
-        bent = sine > _BENT_SINE
-        if not bent.any():
-            return swing, weights
+        if not sine.max() > _BENT_SINE:
+            return None
         forward = self.rest_frame[:, 2] if lower == "elbow" else -self.rest_frame[:, 2]
         rest = _columns(bone[0], np.cross(bone[0], forward))
-        posed = _columns(bone[1], np.where(bent[:, None], hinge, forward))
-        turns = posed @ rest.T
-        is_good = bent & np.isfinite(turns).all((1, 2))
-        return np.where(is_good[:, None, None], turns, swing), np.where(is_good, sine**2, 0.0)
+        bent = sine > 0.5 * sine.max()
+        turns = _columns(bone[1], np.where(bent[:, None], hinge, bone[1][:, [1, 2, 0]])) @ rest.T
+        return turns, np.where(bent, sine**2, 0.0)
 
 
 def _nearness(angles: Array) -> Array:

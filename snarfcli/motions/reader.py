@@ -22,6 +22,7 @@ from snarfcli.motions.arrays import MAX_POSE_BYTES, POSE_KEYS, motion_from_array
 from snarfcli.motions.layouts import HANDS
 from snarfcli.motions.motion import Motion
 from snarfcli.motions.retarget import choose_clip, retarget
+from snarfcli.motions.rig_rest import check_rest
 from snarfcli.motions.up_axis import UPS, Up
 
 __all__ = ["MOTION_SUFFIXES", "read_motion"]
@@ -39,6 +40,7 @@ def read_motion(
     *,
     up: Up = "auto",
     hands: str = "rest",
+    rest: str = "auto",
     mapping: str | Path | Mapping[str, str | None] | None = None,
     clip: str | int | None = None,
 ) -> Motion:
@@ -62,6 +64,10 @@ def read_motion(
             of the skeleton itself has y up, as the format requires.
         hands: pose of SMPL's two hand joints if an array has fingers instead: `rest`, zero; or `released`, values 66 to 72, as
             in the training data of the released code.
+        rest: for rigs, the rest pose that is compared with that of the skeleton. `file`: that of the file; `clip`: the frames
+            of the clip, in which no limb is taken to be twisted on average; a number: that frame of the clip, for clips in
+            which the person stands in a T- or A-pose for a moment; `auto`: that of the file, and the clip for limbs that do not
+            rest as in a standing person (all bones along one axis).
         mapping: for rigs, the joint of the file that moves each joint of the skeleton: {target: source}, or the path of such a
             JSON file. Other joints are mapped by name; null keeps a joint at rest.
         clip: for rigs, name or index of the clip; the first by default.
@@ -77,6 +83,7 @@ def read_motion(
         raise ValueError(f"up: wanted 'auto', 'y' or 'z', got {up!r}")
     if hands not in HANDS:
         raise ValueError(f"hands: wanted 'rest' or 'released', got {hands!r}")
+    check_rest(rest)
     path = Path(path)
     skeleton = _smpl_skeleton() if skeleton is None else skeleton
     suffix = path.suffix.lower()
@@ -84,8 +91,8 @@ def read_motion(
         rig = _read_rig(path, suffix)
         chosen = choose_clip(rig, clip, path)
         name = path.stem if len(rig.clips) == 1 else f"{path.stem}_{chosen.name}"
-        return retarget(rig, chosen, skeleton, path=path, name=name, up=up, mapping=mapping)
-    for setting, value in (("mapping", mapping), ("clip", clip)):
+        return retarget(rig, chosen, skeleton, path=path, name=name, up=up, rest=rest, mapping=mapping)
+    for setting, value in (("mapping", mapping), ("clip", clip), ("rest", None if rest == "auto" else rest)):
         if value is not None:
             raise UserError(
                 f"{setting}: wanted a file ending in {', '.join(_RIG_SUFFIXES)}, got pose file {path}; leave it out"

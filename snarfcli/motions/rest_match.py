@@ -67,6 +67,11 @@ class RestMatch:
         """Return the positions [3] at rest of all paired parts of the body; `side` is 0 for the skeleton, 1 for the rig."""
         return {part: self.target[joint] if side == 0 else self.source[self.pairs[joint]] for joint, part in self.names.items()}
 
+    def spine_points(self, side: int) -> list[Array]:
+        """Return the positions [3] at rest of the paired joints of the spine, from bottom to top; `side` as in `points`."""
+        joints = [joint for joint in self.spine if joint in self.pairs]
+        return [self.target[joint] if side == 0 else self.source[self.pairs[joint]] for joint in joints]
+
     def limb(self, name: str) -> list[int]:
         """Return the paired joints of a limb, a name of `LIMB_ROOTS`, from the trunk outwards; empty if it has none."""
         root = next((self.parts[part] for part in LIMB_ROOTS[name] if self.parts.get(part) in self.pairs), None)

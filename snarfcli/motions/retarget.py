@@ -3,7 +3,8 @@
 Let R_S be the world rotation of a joint of the file relative to its rest pose. The joint of the skeleton gets the world
 rotation R_S Q. Q is constant and rotates the rest pose of the skeleton to that of the file: first as a whole, for files that
 face another way or lie at rest, then bone by bone, by the smallest rotation to the direction of the file's bone. So an arm that
-is level in one rest pose and hangs in the other ends at the same place, and twist is kept.
+is level in one rest pose and hangs in the other ends at the same place, and twist is kept. Where the rest pose of the file is
+not that of a standing person, Q is found from the frames of the clip (`clip_turns`).
 """
 
 from __future__ import annotations
@@ -14,21 +15,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from snarfcli.bodies import Skeleton
-from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.errors import UserError, nearest
 from snarfcli.formats.rig import Rig, RigClip
-from snarfcli.motions.clip_turns import clip_turns, doubtful_limbs, false_toes
+from snarfcli.motions.clip_turns import all_limbs, clip_turns, doubtful_limbs, false_toes
 from snarfcli.motions.joint_names import find_body_parts
 from snarfcli.motions.layouts import layout_of
 from snarfcli.motions.mapping import map_joints
 from snarfcli.motions.motion import Motion
 from snarfcli.motions.rest_match import RestMatch
 from snarfcli.motions.rest_poses import rest_turns
+from snarfcli.motions.rig_rest import resting_in, straightened, turned
 from snarfcli.motions.up_axis import Up, up_axis, y_from_z_up
 
 __all__ = ["choose_clip", "retarget"]
@@ -40,7 +40,6 @@ Array = NDArray[np.float64]
 _LEGS = (("l_hip", "l_knee"), ("l_knee", "l_ankle"), ("r_hip", "r_knee"), ("r_knee", "r_ankle"))
 _MAX_DISTANCE_M = 1e6
 _STRETCH = 0.2  # maximum relative difference between the lengths of bones at rest and in the clip
-_SAME_SKELETON_M = 1e-3  # maximum difference of joint positions, relative to their parents, in two files of one skeleton
 
 
 def choose_clip(rig: Rig, clip: str | int | None, path: Path) -> RigClip:
@@ -73,6 +72,7 @@ def retarget(
     path: Path,
     name: str,
     up: Up = "auto",
+    rest: str = "auto",
     mapping: str | Path | Mapping[str, str | None] | None = None,
 ) -> Motion:
     """Convert a clip of a rig to poses of a skeleton.
@@ -89,6 +89,8 @@ def retarget(
         path: file of the rig, for messages.
         name: name of the motion.
         up: up axis of the file; `auto`: the axis along which the body stands during the clip, or else at rest.
+        rest: rest pose that is compared with that of the skeleton: `auto`, `file`, `clip` or the number of a frame, see
+            `read_motion`.
         mapping: see `map_joints`.
 
     Raises:
@@ -104,21 +106,21 @@ def retarget(
         log.info("%s: joints without a counterpart follow their parents: %s", path.name, ", ".join(unpaired))
     parts = find_body_parts(skeleton.names, skeleton.parents)
     joints_rest = skeleton.joints_rest.detach().cpu().double().numpy()
-    straightened = _straightened(rig, skeleton, pairs)
-    if up == "auto" and straightened is not rig and path.suffix.lower() in (".glb", ".gltf"):
+    own = straightened(rig, skeleton, pairs)
+    if up == "auto" and own is not rig and path.suffix.lower() in (".glb", ".gltf"):
         up = "y"  # the file was exported for this skeleton, so it follows the format; a lying body would mislead the guess
-    rig = straightened
+    rig = resting_in(rig, clip, int(rest), path) if rest.isdecimal() else own
     match = RestMatch(pairs, parts.joints, parts.spine, joints_rest, rig.rest[:, :3, 3], skeleton.parents, rig.parents)
     if not np.isfinite(rig.rest).all():
         raise UserError(f"{path} has NaN or infinity in its rest pose; export it again")
-    turned = {joint: _turned(rig, clip, number, path) for joint, number in pairs.items()}
-    turns = _turns(match, turned, clip.world_from_joint[..., :3, 3], path)
-    axis = _up(Rotation.from_matrix(turned[0] @ turns[0]), turns[0]) if up == "auto" else up
+    moved = {joint: turned(rig, clip, number, path) for joint, number in pairs.items()}
+    turns = _turns(match, moved, clip.world_from_joint[..., :3, 3], rest, path)
+    axis = _up(Rotation.from_matrix(moved[0] @ turns[0]), turns[0]) if up == "auto" else up
     if up == "auto" and axis == "z":
         log.info("%s: z is up in this file and was turned to y", path.name)
     upright = y_from_z_up().as_matrix() if axis == "z" else np.eye(3)
 
-    rotations = {joint: upright @ turned[joint] @ turns[joint] for joint in pairs}
+    rotations = {joint: upright @ moved[joint] @ turns[joint] for joint in pairs}
     poses = _local_poses(rotations, skeleton.parents, len(clip.world_from_joint))
     translation = _translation(match, clip, rotations[0], upright)
     if not np.abs(translation).max() < _MAX_DISTANCE_M:
@@ -126,26 +128,28 @@ def retarget(
     return Motion(name, poses, translation, clip.frame_rate)
 
 
-def _turns(match: RestMatch, turned: Mapping[int, Array], posed: Array, path: Path) -> dict[int, Array]:
+def _turns(match: RestMatch, moved: Mapping[int, Array], posed: Array, rest: str, path: Path) -> dict[int, Array]:
     """Return the rotation [3, 3] per paired joint from the rest pose of the skeleton to that of the rig.
 
     Args:
         match: the paired joints at rest.
-        turned: [T, 3, 3] per paired joint, world rotations of the rig's joints relative to their rest.
+        moved: [T, 3, 3] per paired joint, world rotations of the rig's joints relative to their rest.
         posed: [T, K, 3], places of the rig's joints.
+        rest: which rest pose counts, as in `retarget`.
         path: file of the rig, for messages.
     """
     turns = rest_turns(match, without_bone=false_toes(match, posed))
-    doubtful = doubtful_limbs(match)
-    if doubtful:
+    limbs = {"auto": doubtful_limbs, "clip": all_limbs}.get(rest, lambda _: [])(match)
+    if not limbs:
+        return turns
+    if rest == "auto":
         log.info(
-            "%s: the rest pose is not that of a standing person (%s), so rotations are relative to the frames of the clip;"
-            " rest=file takes the rest pose of the file, rest=NUMBER the frame of that number",
+            "%s: the rest pose is not that of a standing person (%s), so the frames of the clip were used instead (rest=file"
+            " takes the rest pose as it is, rest=NUMBER that frame)",
             path.name,
-            ", ".join(name.replace("l_", "left ").replace("r_", "right ") for name in doubtful),
+            ", ".join(name.replace("l_", "left ").replace("r_", "right ") for name in limbs),
         )
-        turns |= clip_turns(match, doubtful, turns, turned, posed)
-    return turns
+    return turns | clip_turns(match, limbs, turns, moved, posed)
 
 
 def _local_poses(rotations: Mapping[int, Array], parents: Sequence[int], frames: int) -> Array:
@@ -166,57 +170,6 @@ def _local_poses(rotations: Mapping[int, Array], parents: Sequence[int], frames:
         local = world[:, joint] if parent < 0 else world[:, parent].transpose(0, 2, 1) @ world[:, joint]
         poses[:, joint] = Rotation.from_matrix(local).as_rotvec()
     return poses
-
-
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _straightened(rig: Rig, skeleton: Skeleton, pairs: Mapping[int, int]) -> Rig:
-    """Return a rig of the skeleton itself in the rest pose of the skeleton; any other rig unchanged.
-
-    A rig is of the skeleton itself if the positions of all joints relative to the frames of their parents agree.
-    """
-    parents = [rig.parents[pairs[joint]] if joint in pairs else None for joint in range(skeleton.num_joints)]
-    if any(parent != pairs.get(own, -1) for parent, own in zip(parents, skeleton.parents, strict=True)):
-        return rig
-    frames = rig.rest[[pairs[joint] for joint in range(skeleton.num_joints)]]
-    joints_rest = skeleton.joints_rest.detach().cpu().double().numpy()
-    below = [joint for joint, parent in enumerate(skeleton.parents) if parent >= 0]
-    above = [skeleton.parents[joint] for joint in below]
-    try:
-        local = np.linalg.solve(frames[above], frames[below])[:, :3, 3]
-    except np.linalg.LinAlgError:
-        return rig
-    wanted = joints_rest[below] - joints_rest[above]
-    scale = (local * wanted).sum() / max((wanted * wanted).sum(), 1e-30)
-    if not scale > 0 or np.abs(local / scale - wanted).max() > _SAME_SKELETON_M:
-        return rig
-    sizes = np.linalg.norm(frames[:, :3, :3], axis=1)  # of the axes
-    rest = rig.rest.copy()
-    for joint, number in pairs.items():
-        rest[number, :3, :3] = np.diag(sizes[joint])
-        rest[number, :3, 3] = frames[0, :3, 3] + scale * sizes[0].mean() * (joints_rest[joint] - joints_rest[0])
-    return replace(rig, rest=rest)
-
-
-def _turned(rig: Rig, clip: RigClip, number: int, path: Path) -> Array:
-    """Return the world rotations [T, 3, 3] of a joint of the rig relative to its rest, without scale."""
-    rest = rig.rest[number, :3, :3]
-    posed = clip.world_from_joint[:, number]
-    if not np.isfinite(posed).all():
-        frame = int(np.argwhere(~np.isfinite(posed))[0][0])
-        raise UserError(f"{path}: joint {rig.names[number][:40]!r} has NaN or infinity in frame {frame}; export it again")
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        size = np.linalg.norm(rest, axis=0)
-        volume = np.linalg.det(rest / size)
-    if not abs(volume) > 1e-6:
-        raise UserError(f"{path}: joint {rig.names[number][:40]!r} has scale 0 at rest; export it without scale 0")
-    with np.errstate(over="ignore", invalid="ignore"):
-        moved = posed[:, :3, :3] @ np.linalg.inv(rest)
-        largest = np.abs(moved).max()
-        moved = moved if 1e-3 < largest < 1e3 else moved / (np.abs(moved).max((1, 2), keepdims=True) + 1e-300)
-    if not np.isfinite(moved).all():
-        raise UserError(f"{path}: joint {rig.names[number][:40]!r} has a scale that overflows; export it again")
-    is_rotation = np.abs(moved.transpose(0, 2, 1) @ moved - np.eye(3)).max() < 1e-12 and np.linalg.det(moved).min() > 0
-    return moved if is_rotation else nearest_rotation(torch.from_numpy(moved)).numpy()
 
 
 def _up(upright: Rotation, rest: Array) -> Up:

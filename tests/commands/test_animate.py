@@ -59,6 +59,7 @@ def config(tmp_path: Path, pose_file: Path, toy: ToyAvatar) -> AnimateConfig:
         pose=str(pose_file),
         up="y",
         hands="rest",
+        rest="auto",
         mapping=None,
         clip=None,
         data_root=str(tmp_path / "data"),

@@ -59,6 +59,7 @@ def config(tmp_path: Path, toy: ToyAvatar, monkeypatch) -> ViewConfig:
         threads=None,
         up="y",
         hands="rest",
+        rest="auto",
         mapping=None,
         clip=None,
         motion_seed=0,

@@ -64,7 +64,7 @@ def eval_config(config: TrainConfig, **changes) -> EvalConfig:
 def animate_config(config: TrainConfig, pose: Path, **changes) -> animate.AnimateConfig:
     settings = animate.AnimateConfig(
         subject="toy", data=config.data, data_root=config.data_root, output_root=config.output_root, run=config.run,
-        ckpt=None, pose=str(pose), up="y", hands="rest", mapping=None, clip=None, motion=None, motion_seed=0,
+        ckpt=None, pose=str(pose), up="y", hands="rest", rest="auto", mapping=None, clip=None, motion=None, motion_seed=0,
         motion_frame_rate=30.0, start=0, stop=None, step=1, frame_rate=None, max_frames=None, in_place=False,
         surface="field", resolution=24, keep_share=0.01, meshes=True, format="ply", weight_colors=False, video=False,
         video_size="64", views=["front"], azimuth_deg=0.0, elevation_deg=0.0, camera="still", turntable="false", beside=[],

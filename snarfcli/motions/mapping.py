@@ -10,11 +10,11 @@ from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
 from snarfcli.formats.rig import Rig
-from snarfcli.motions.joint_names import BodyParts, find_body_parts, plain_name
+from snarfcli.motions.joint_names import REQUIRED_PARTS, BodyParts, find_body_parts
+from snarfcli.motions.plain_names import plain_name
 
 __all__ = ["map_joints"]
 
-_REQUIRED = ("pelvis", "l_hip", "r_hip", "l_knee", "r_knee", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow")
 _MAX_LETTERS = 280  # of the names in a message
 
 
@@ -58,8 +58,8 @@ def map_joints(
 
 def _check_pairs(pairs: dict[int, int], target: BodyParts, source: BodyParts, skeleton: Skeleton, rig: Rig, path: Path) -> None:
     """Raise UserError if required parts of a human body, or half the joints of another skeleton, have no counterpart."""
-    missing = [part for part in _REQUIRED if part in target.joints and part not in source.joints]
-    is_human = all(part in target.joints for part in _REQUIRED)
+    missing = [part for part in REQUIRED_PARTS if part in target.joints and part not in source.joints]
+    is_human = all(part in target.joints for part in REQUIRED_PARTS)
     if missing:
         what = f"no joint for {', '.join(missing)}"
     elif not is_human and 2 * len(pairs) < skeleton.num_joints:

@@ -14,7 +14,7 @@ from snarfcli.motions.name_words import NOTHING, JointName, read_names
 from snarfcli.motions.plain_names import plain_name
 from snarfcli.motions.trees import common_ancestor, path_up
 
-__all__ = ["REQUIRED_PARTS", "BodyParts", "find_body_parts", "plain_name"]
+__all__ = ["REQUIRED_PARTS", "BodyParts", "find_body_parts", "plain_name", "spine_between"]
 
 REQUIRED_PARTS = ("pelvis", "l_hip", "r_hip", "l_knee", "r_knee", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow")
 """SMPL's names of the parts without which a tree is no human body."""
@@ -107,7 +107,7 @@ def _find(names: Sequence[JointName], parents: Sequence[int], *, is_strict: bool
     found |= {} if pelvis is None else {"pelvis": pelvis}
     if not is_strict:
         found |= _neck_and_head(names, parents, found)
-    return BodyParts(found, _spine(found, parents))
+    return BodyParts(found, spine_between(found, parents))
 
 
 def _chain(
@@ -184,8 +184,8 @@ def _is_trunk(name: JointName) -> bool:
     return bool(name.words & _TRUNK) and not name.side and name.doubt <= _MAX_DOUBT
 
 
-def _spine(found: dict[str, int], parents: Sequence[int]) -> tuple[int, ...]:
-    """Return the joints between the pelvis and the neck, or the head, collar or shoulder if there is no neck."""
+def spine_between(found: Mapping[str, int], parents: Sequence[int]) -> tuple[int, ...]:
+    """Return the joints from pelvis to neck, both excluded, or to the head, collar or shoulder if there is no neck."""
     tops = [found[name] for name in ("neck", "head", "l_collar", "l_shoulder") if name in found]
     if "pelvis" not in found or not tops:
         return ()

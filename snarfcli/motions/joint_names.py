@@ -39,13 +39,14 @@ _LEG = {
 _ARM = {
     "collar": _costs("collar 0, scapula 0.5, shoulder 1"),
     "shoulder": _costs("upper+arm 0, arm 1, humerus 1.1, shoulder 2"),
-    "elbow": _costs("elbow 0, fore+arm 0.1, lower+arm 0.2, radius 0.3, arm 3"),
+    "elbow": _costs("elbow 0, fore+arm 0.1, lower+arm 0.2, radius 0.3, ulna 0.4, arm 3"),
     "wrist": _costs("wrist 0, hand 1, arm 4"),
 }
 _HEAD = {"neck": _costs("neck 0, lower+neck 0.5"), "head": _costs("head 0")}
 _PELVIS = _costs("pelvis 0, hip 1, lower+body 1.5, lower+torso 1.5")
-_ROOT, _COMMON, _TRUNK_COMMON = 6.0, 5.0, 2.5  # cost of `root`, of the joint where the legs meet, of one named as the trunk
-_NO_PELVIS_ABOVE = 3.0  # cost of a pelvis that is not above both legs
+_ROOT, _OF_WORLD = 4.5, 1.5  # cost of a `root` as pelvis, and of one that is above the joint where the legs meet
+_MEETING, _TRUNK_MEETING = 5.0, 2.5  # cost of the joint where the legs meet as pelvis, and of one that is named as the trunk
+_NOT_ABOVE_LEGS = 3.0  # cost of a pelvis that is not above both legs
 _WITHOUT = {"hip": 12.0, "knee": 12.0, "shoulder": 12.0, "elbow": 12.0}  # cost of a limb without the part
 _WITHOUT_OTHERS = 6.0
 _TRUNK = {"spine", "torso", "neck", "head"}
@@ -146,15 +147,20 @@ def _hand_and_eye(names: Sequence[JointName], side: str, found: Mapping[str, int
 
 def _pelvis(names: Sequence[JointName], parents: Sequence[int], found: Mapping[str, int], is_strict: bool) -> int | None:
     """Return the joint of the pelvis: by name, or else where the legs meet, as in Rigify's or Kinect's spine."""
-    candidates = _candidates(names, "", _PELVIS, is_strict)
-    candidates |= {joint: _ROOT for joint, name in enumerate(names) if name.side == "" and name.words == {"root"}}
-    if "l_hip" in found and "r_hip" in found and not is_strict:
-        meeting = common_ancestor(found["l_hip"], found["r_hip"], parents)
-        above = set(path_up(meeting, parents))
-        candidates = {joint: cost + (0 if joint in above else _NO_PELVIS_ABOVE) for joint, cost in candidates.items()}
-        if meeting >= 0:
-            cost = _TRUNK_COMMON if names[meeting].words & _TRUNK else _COMMON
-            candidates[meeting] = min(candidates.get(meeting, cost), cost)
+    named = _candidates(names, "", _PELVIS, is_strict)
+    roots = {joint: _ROOT for joint, name in enumerate(names) if name.side == "" and name.words == {"root"}}
+    if "l_hip" not in found or "r_hip" not in found or is_strict:
+        return _cheapest(roots | named)
+    meeting = common_ancestor(found["l_hip"], found["r_hip"], parents)
+    above = set(path_up(meeting, parents))
+    named = {joint: cost + (0 if joint in above else _NOT_ABOVE_LEGS) for joint, cost in named.items()}
+    # A root above the joint where the legs meet is that of the world.
+    roots = {joint: cost + (_OF_WORLD if joint in above - {meeting} else 0) for joint, cost in roots.items()}
+    met = {meeting: _TRUNK_MEETING if names[meeting].words & _TRUNK else _MEETING} if meeting >= 0 else {}
+    return _cheapest(met | roots | named)
+
+
+def _cheapest(candidates: Mapping[int, float]) -> int | None:
     return min(candidates, key=lambda joint: (candidates[joint], joint), default=None)
 
 

@@ -19,7 +19,7 @@ _BODY = {
     "thigh": "thigh femur", "leg": "leg 足 脚", "knee": "knee ひざ 膝", "shin": "shin calf tibia shank すね",
     "ankle": "ankle talus 足首", "foot": "foot feet", "toe": "toe toes つま先 爪先 足先", "ball": "ball",
     "collar": "collar clavicle clav collarbone 鎖骨", "scapula": "scapula scap", "shoulder": "shoulder shldr 肩",
-    "arm": "arm 腕", "humerus": "humerus", "elbow": "elbow ひじ 肘", "radius": "radius ulna", "wrist": "wrist 手首",
+    "arm": "arm 腕", "humerus": "humerus", "elbow": "elbow ひじ 肘", "radius": "radius", "ulna": "ulna", "wrist": "wrist 手首",
     "hand": "hand palm 手", "finger": "finger fingers 指", "thumb": "thumb 親指", "index": "index 人指 人差指 人差し指",
     "middle": "middle mid 中指", "ring": "ring 薬指", "pinky": "pinky pinkie little 小指",
     "upper": "upper up upr", "lower": "lower low lo lwr", "fore": "fore",
@@ -63,7 +63,7 @@ _MAX_LETTERS = 100
 # Beside the name of a part, that of the larger part says nothing: `foot_ankle`, `LLeg_Calf`, `hand_index1`, `head_eye`.
 _WITHIN = {
     "leg": {"thigh", "knee", "shin", "ankle", "foot", "toe", "ball"}, "foot": {"ankle", "toe", "ball"},
-    "arm": {"collar", "scapula", "shoulder", "humerus", "elbow", "radius", "wrist", "hand"},
+    "arm": {"collar", "scapula", "shoulder", "humerus", "elbow", "radius", "ulna", "wrist", "hand"},
     "hand": {"wrist", "finger", "thumb", "index", "middle", "ring", "pinky"},
     "finger": {"thumb", "index", "middle", "ring", "pinky"}, "head": {"eye", "jaw"}, "spine": {"neck"},
 }  # fmt: skip

@@ -102,7 +102,9 @@ def _find(names: Sequence[JointName], parents: Sequence[int], *, is_strict: bool
         for limb in (_LEG, _ARM):
             found |= {f"{side}_{part}": joint for part, joint in _chain(limb, names, side, parents, is_strict).items()}
         found |= _hand_and_eye(names, side, found)
-    jaw = next((joint for joint, name in enumerate(names) if name.doubt <= 0 and (name.side, name.words) == ("", {"jaw"})), None)
+    jaw = next(
+        (joint for joint, name in enumerate(names) if name.doubt <= 0 and (name.side, name.words) == ("", {"jaw"})), None
+    )
     found |= {} if jaw is None else {"jaw": jaw}
     pelvis = _pelvis(names, parents, found, is_strict)
     found |= {} if pelvis is None else {"pelvis": pelvis}
@@ -138,8 +140,8 @@ def _hand_and_eye(names: Sequence[JointName], side: str, found: Mapping[str, int
     for joint, name in enumerate(names):
         if name.side == side and name.doubt <= 0 and joint != found.get(f"{side}_wrist"):
             first.setdefault((name.words, name.numbers), joint)
-    parts = {f"{finger}{number}": (finger, (number,)) for finger in _FINGERS for number in (1, 2, 3)} | {"eye": ("eye", ())}
-    looked_up = {part: first.get((frozenset({word}), numbers)) for part, (word, numbers) in parts.items()}
+    looked_up = {f"{finger}{at}": first.get((frozenset({finger}), (at,))) for finger in _FINGERS for at in (1, 2, 3)}
+    looked_up["eye"] = first.get((frozenset({"eye"}), ()))
     knuckles = (first.get((frozenset({word}), numbers)) for word, numbers in _KNUCKLES)
     looked_up["hand"] = next((joint for joint in knuckles if joint is not None), None)
     return {f"{side}_{part}": joint for part, joint in looked_up.items() if joint is not None}
@@ -178,10 +180,11 @@ def _neck_and_head(names: Sequence[JointName], parents: Sequence[int], found: Ma
         return {} if neck == found["head"] or names[neck].doubt > _MAX_DOUBT or names[neck].side else {"neck": neck}
     path = [found.get("neck", chest)]
     arms = {joint for side in "lr" for joint in path_up(found[f"{side}_{arm}"], parents)}
-    while path[-1] >= 0:
-        above = (joint for joint, parent in enumerate(parents) if parent == path[-1] and joint not in arms)
-        path.append(next((joint for joint in above if _is_trunk(names[joint])), -1))
-    path = path[1:-1]
+    # a parent comes before its children
+    for joint in range(path[0] + 1, len(names)):
+        if parents[joint] == path[-1] and joint not in arms and _is_trunk(names[joint]):
+            path.append(joint)
+    del path[0]
     parts = {"head": path[-1]} if path else {}
     return parts | ({"neck": path[0]} if len(path) > 1 and "neck" not in found else {})
 
@@ -199,6 +202,6 @@ def spine_between(found: Mapping[str, int], parents: Sequence[int]) -> tuple[int
     if found["pelvis"] in chain:
         chain = chain[: chain.index(found["pelvis"])]
     else:  # the pelvis is beside the spine, as another child of a common ancestor
-        above = path_up(found["pelvis"], parents)
+        above = set(path_up(found["pelvis"], parents))
         chain = [joint for joint in chain if joint not in above]
     return tuple(joint for joint in reversed(chain) if joint not in found.values())

@@ -11,6 +11,11 @@ from functools import lru_cache
 
 __all__ = ["NOTHING", "JointName", "read_names"]
 
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
 # Canonical word -> spellings. A spelling of several words, as `uarm`, is in `_COMPOUNDS`.
 _BODY = {
     "pelvis": "pelvis 下半身", "hip": "hip hips", "torso": "torso", "spine": "spine chest abdomen abdo ab thorax waist ribcage"
@@ -30,21 +35,25 @@ _COMPOUNDS = {
     "uarm": ("upper", "arm"), "farm": ("fore", "arm"), "uleg": ("upper", "leg"), "proximal": ("1",), "intermediate": ("2",),
     "distal": ("3",),
 }  # fmt: skip
-_SIDES = {"l": "l", "left": "l", "lft": "l", "左": "l", "r": "r", "right": "r", "rgt": "r", "右": "r"}
+_SIDES = {
+    **dict.fromkeys(_words("l lf lt lft left 左"), "l"),
+    **dict.fromkeys(_words("r rt rgt right 右"), "r"),
+}
+_ALONE = _words("lf lt rt c m x b j f")  # never part of a longer word: `lfarm` is the left forearm
 # Words that say nothing about the part: names of programs, `joint`, and letters for the middle of the body.
-_FILLERS = set(
+_FILLERS = _words(
     "mixamorig bip biped valve character cc j b bn f bone joint jnt jt bind skin skel skeleton sk rig armature c m x"
-    " center centre mesh smpl smplh smplhf smplx def".split()
+    " center centre mesh smpl smplh smplhf smplx def"
 )
 # Words of joints beside the bone of the same name, with the cost of taking such a joint for it all the same.
-_ASIDE = {"bend": 0.5, "stretch": 0.5, "org": 0.5, "fk": 2.0, **dict.fromkeys("twist roll part share 捩 捩り".split(), 4.0)}
+_ASIDE = {"bend": 0.5, "stretch": 0.5, "org": 0.5, "fk": 2.0, **dict.fromkeys(_words("twist roll part share 捩 捩り"), 4.0)}
 # Words of joints that are no part of the body although their names may say so: controls, tips, clothes, things carried.
-_OTHERS = set(
+_OTHERS = _words(
     "ik pole target tgt ctrl ctr ctl control controller con effector eff goal handle end nub tip top site mch parent tweak proc"
     " socket weapon gun sword shield prop item camera cam marker locator loc null grp group offset pivot hair skirt cloth cape"
     " sleeve tail wing fin ear horn antenna breast bust boob pec butt buttock glute nail tongue lip cheek brow lid eyelid nose"
     " tooth teeth chin jiggle phys physics sec proxy dummy ダミー 親 キャンセル attach holder volume muscle corrective corr"
-    " driver drv aim look metacarpal metacarpals heel slide adj helper help aux".split()
+    " driver drv aim look metacarpal metacarpals heel slide adj helper help aux"
 )
 _LEXICON: dict[str, tuple[str, ...]] = {
     **{word: (word,) for word in {*_FILLERS, *_ASIDE, *_OTHERS, *_SIDES}},
@@ -137,16 +146,17 @@ def _known_words(text: str) -> tuple[str, ...] | None:
     """
     if text in _LEXICON:
         return _LEXICON[text]
-    best: list[tuple[int, tuple[str, ...]] | None] = [(0, ())] + [None] * len(text)
+    best: dict[int, tuple[int, tuple[str, ...]]] = {0: (0, ())}  # by end: number of words, and their canonical forms
     for end in range(1, len(text) + 1):
         for begin in range(max(end - _LONGEST, 0), end):
-            before, word = best[begin], text[begin:end]
-            is_side = word in ("l", "r") and (begin == 0 or end == len(text))
-            if before is None or word not in _LEXICON or (end - begin == 1 and word.isascii() and not is_side):
+            word = text[begin:end]
+            is_inside = word in ("l", "r") and 0 < begin and end < len(text)
+            if begin not in best or word not in _LEXICON or word in _ALONE or is_inside:
                 continue
-            if best[end] is None or before[0] + 1 < best[end][0]:
-                best[end] = (before[0] + 1, before[1] + _LEXICON[word])
-    return best[-1][1] if best[-1] else None
+            count, words = best[begin]
+            if end not in best or count + 1 < best[end][0]:
+                best[end] = count + 1, words + _LEXICON[word]
+    return best[len(text)][1] if len(text) in best else None
 
 
 def _understood(words: list[str]) -> JointName:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ _OTHER_CHAIN = 0.4  # a further chain of trunk, such as a tail or a wing, relati
 _DOWN = -0.8  # cosine of trunk and legs; 0 in animals on four legs
 _SIDEWAYS = 0.2  # largest cosine of the axis left to right and the trunk
 _FOOT_FORWARD = 0.3  # of the length of a foot
-_MAX_CHILDREN, _MAX_CHAIN = 16, 32  # joints that are looked at: the longest chains of a joint, the first of a chain
+_MAX_CHILDREN, _MAX_CHAIN = 12, 32  # joints that are looked at: the longest chains of a joint, the first of a chain
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,8 @@ def find_by_shape(parents: Sequence[int], points: Array, tips: set[int]) -> Shap
         points: [J, 3], joints at rest, any unit, any direction up.
         tips: joints that only mark the end of a bone, such as a BVH file's End Sites.
     """
-    size = np.ptp(points, axis=0).max(initial=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        size = np.ptp(points, axis=0).max(initial=0)
     if not np.isfinite(points).all() or not 0 < size < np.inf:
         return None
     tree = _Tree(parents, (points - points[0]) / size, tips)
@@ -142,7 +143,11 @@ def _mirrored(tree: _Tree, meeting: int, first: int, second: int) -> _Limbs | No
     at = int(np.argmax(mean[:-1] + mean[1:]))
     upper, lower = mean[at], mean[at + 1]
     others = np.delete(mean, [at, at + 1])
-    if lower <= 0 or not _BONE_RATIO[0] <= upper / lower <= _BONE_RATIO[1] or others.max(initial=0) > _NEXT_BONE * min(upper, lower):
+    if (
+        lower <= 0
+        or not _BONE_RATIO[0] <= upper / lower <= _BONE_RATIO[1]
+        or others.max(initial=0) > _NEXT_BONE * min(upper, lower)
+    ):
         return None
     left, right = (tree.points[chain[: at + 3]] - tree.points[meeting] for chain in chains)
     across = (left - right).sum(0)
@@ -174,7 +179,9 @@ def _person(tree: _Tree, legs: _Limbs, arms: _Limbs) -> ShapeParts | None:
     inner = {*path_up(arms.meeting, tree.parents), *path_up(legs.meeting, tree.parents)}
     starts = {joint for limbs in (legs, arms) for chain in limbs.chains for joint in chain[: limbs.bones + 1]}
     others = [joint for at in inner for joint in tree.children[at] if joint not in inner | starts]
-    heads = [joint for joint in others if tree.parents[joint] == arms.meeting and _is_head(tree, joint, arms, up, float(length))]
+    heads = [
+        joint for joint in others if tree.parents[joint] == arms.meeting and _is_head(tree, joint, arms, up, float(length))
+    ]
     if len(heads) != 1 or any(tree.to_end(joint) > _OTHER_CHAIN * legs.length for joint in others if joint not in heads):
         return None
     return _named(tree, legs, arms, heads[0], up)
@@ -213,7 +220,8 @@ def _left(tree: _Tree, legs: _Limbs, up: Array) -> tuple[Array, bool]:
     forward = feet.sum(0)
     forward = forward - (forward @ up) * up - (forward @ legs.across) * legs.across
     is_clear = np.linalg.norm(forward) >= _FOOT_FORWARD * np.linalg.norm(feet, axis=1).sum()
-    return (np.cross(up, forward), True) if is_clear else (legs.across, False)
+    left = np.asarray(np.cross(up, forward), dtype=np.float64) if is_clear else legs.across
+    return left, bool(is_clear)
 
 
 def _neck_and_head(tree: _Tree, joint: int) -> dict[str, int]:
@@ -222,7 +230,7 @@ def _neck_and_head(tree: _Tree, joint: int) -> dict[str, int]:
     while len(tree.children[chain[-1]]) == 1:  # eyes and jaw are children of the head
         chain += tree.children[chain[-1]]
     if len(chain) > 1 and not tree.children[chain[-1]]:
-        bones = [tree.distance(first, second) for first, second in zip(chain, chain[1:], strict=False)]
+        bones = [tree.distance(first, second) for first, second in pairwise(chain)]
         if chain[-1] in tree.tips or (len(bones) > 1 and bones[-1] > 1.2 * np.mean(bones[:-1])):  # the top of the head
             chain.pop()
     return {"head": chain[-1]} | ({"neck": chain[0]} if len(chain) > 1 else {})

@@ -55,7 +55,7 @@ _FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 _KNUCKLES = (("hand", ()), ("finger", ()), ("middle", (1,)), ("index", (1,)), ("finger", (1,)))
 _NUMBER, _PER_NUMBER = 0.3, 0.01  # cost of a number: `neck` before `neck1` before `neck2`
 _MAX_DOUBT = 4.5
-_MAX_STRICT_COST = 2.0
+_MAX_STRICT_COST = 2.0  # of names that count even if there is no whole body
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,8 @@ def _candidates(names: Sequence[JointName], side: str, costs: dict[Words, float]
         if name.side != side or name.words not in costs or name.doubt > _MAX_DOUBT:
             continue
         cost = costs[name.words]
-        is_clear = name.doubt <= 0 and cost <= _MAX_STRICT_COST and name.numbers in ((), (0,), (1,))
+        is_first = not name.numbers or (name.numbers in ((0,), (1,)) and name.words <= {"toe", "neck"})
+        is_clear = name.doubt <= 0 and cost <= _MAX_STRICT_COST and is_first
         if is_clear or not is_strict:
             number = min(sum(number * 0.1**at for at, number in enumerate(name.numbers)), 20)
             candidates[joint] = cost + name.doubt + (_NUMBER + _PER_NUMBER * number if name.numbers else 0)

@@ -150,7 +150,7 @@ def _known_words(text: str) -> tuple[str, ...] | None:
     for end in range(1, len(text) + 1):
         for begin in range(max(end - _LONGEST, 0), end):
             word = text[begin:end]
-            is_inside = word in ("l", "r") and 0 < begin and end < len(text)
+            is_inside = word in ("l", "r") and begin > 0 and end < len(text)
             if begin not in best or word not in _LEXICON or word in _ALONE or is_inside:
                 continue
             count, words = best[begin]

@@ -1,4 +1,4 @@
-"""The joints of a person in the names of 65 programs, data sets and games, with what exporters add to them."""
+"""The joints of a person in the names of many programs, data sets and games, with what exporters add to them."""
 
 from __future__ import annotations
 

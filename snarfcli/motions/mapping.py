@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,11 +11,15 @@ from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
 from snarfcli.formats.rig import Rig
-from snarfcli.motions.joint_names import BodyParts, find_body_parts, plain_name
+from snarfcli.motions.joint_names import REQUIRED_PARTS, BodyParts, find_body_parts, spine_between
+from snarfcli.motions.plain_names import plain_name
+from snarfcli.motions.tree_shape import find_by_shape
 
 __all__ = ["map_joints"]
 
-_REQUIRED = ("pelvis", "l_hip", "r_hip", "l_knee", "r_knee", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow")
+log = logging.getLogger(__name__)
+
+_SHAPED = (*REQUIRED_PARTS, "l_ankle", "r_ankle", "l_wrist", "r_wrist")  # parts in which names and shape have to agree
 _MAX_LETTERS = 280  # of the names in a message
 
 
@@ -24,7 +29,8 @@ def map_joints(
     """Return the index of the rig's joint that moves each joint of the skeleton; joints without one are left out.
 
     If the rig has every name of the skeleton, joints are paired by name. Otherwise they are paired as parts of a human body,
-    the joints of the spine from both ends, and the remaining joints by name. `mapping` overrides both.
+    the joints of the spine from both ends, and the remaining joints by name. Parts that names do not tell are taken from the
+    shape of the tree if that is clearly a person. `mapping` overrides all this.
 
     Args:
         skeleton: the target.
@@ -42,6 +48,8 @@ def map_joints(
         pairs = {joint: exact[name] for joint, name in enumerate(skeleton.names)}
     else:
         target, source = find_body_parts(skeleton.names, skeleton.parents), find_body_parts(rig.names, rig.parents)
+        if mapping is None and source.missing and not target.missing:
+            source = _with_shape(source, rig, path)
         pairs = _pair_parts(target, source)
         for joint, name in enumerate(skeleton.names):
             number = sources.find(name)
@@ -58,8 +66,8 @@ def map_joints(
 
 def _check_pairs(pairs: dict[int, int], target: BodyParts, source: BodyParts, skeleton: Skeleton, rig: Rig, path: Path) -> None:
     """Raise UserError if required parts of a human body, or half the joints of another skeleton, have no counterpart."""
-    missing = [part for part in _REQUIRED if part in target.joints and part not in source.joints]
-    is_human = all(part in target.joints for part in _REQUIRED)
+    missing = [part for part in REQUIRED_PARTS if part in target.joints and part not in source.joints]
+    is_human = all(part in target.joints for part in REQUIRED_PARTS)
     if missing:
         what = f"no joint for {', '.join(missing)}"
     elif not is_human and 2 * len(pairs) < skeleton.num_joints:
@@ -70,6 +78,36 @@ def _check_pairs(pairs: dict[int, int], target: BodyParts, source: BodyParts, sk
         f'{path} has {what}; give mapping=FILE.json with {{"joint of the skeleton": "joint of the file", ...}};'
         f" the skeleton has {_listed(skeleton.names)}; the file has {_listed(rig.names)}"
     )
+
+
+def _with_shape(named: BodyParts, rig: Rig, path: Path) -> BodyParts:
+    """Add the parts that the shape of the rig tells; names that are known decide on left and right.
+
+    Nothing is added if the shape is not clearly that of a person, contradicts the names, or does not tell left from right.
+    """
+    inner = set(rig.parents)
+    tips = {joint for joint, name in enumerate(rig.names) if joint not in inner and name.lower().endswith("_end")}
+    shape = find_by_shape(rig.parents, rig.rest[:, :3, 3], tips)
+    if shape is None:
+        return named
+    parts = [shape.joints, {_other_side(part): joint for part, joint in shape.joints.items()}]
+    fits = [all(each.get(part, joint) == joint for part, joint in named.joints.items() if part in _SHAPED) for each in parts]
+    if not any(fits) or (all(fits) and not shape.has_sides):
+        return named
+    joints = parts[fits.index(True)] | named.joints
+    guessed = [part for part in joints if part not in named.joints]
+    sides = "; left and right are guessed from the feet" if all(fits) else ""
+    log.info(
+        "%s: the shape of the tree gives joints that have no known names (%s)%s; mapping=FILE.json says otherwise",
+        path.name,
+        _listed([f"{part}: {rig.names[joints[part]]}" for part in guessed]),
+        sides,
+    )
+    return BodyParts(joints, spine_between(joints, rig.parents))
+
+
+def _other_side(part: str) -> str:
+    return {"l_": "r_", "r_": "l_"}.get(part[:2], part[:2]) + part[2:]
 
 
 class _Names:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ from snarfcli.motions.rest_poses import rest_turns
 from snarfcli.motions.rig_rest import resting_in, straightened, turned
 from snarfcli.motions.up_axis import Up, up_axis, y_from_z_up
 
-__all__ = ["choose_clip", "retarget"]
+__all__ = ["Retargeted", "choose_clip", "retarget", "retarget_rig"]
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +40,20 @@ Array = NDArray[np.float64]
 _LEGS = (("l_hip", "l_knee"), ("l_knee", "l_ankle"), ("r_hip", "r_knee"), ("r_knee", "r_ankle"))
 _MAX_DISTANCE_M = 1e6
 _STRETCH = 0.2  # maximum relative difference between the lengths of bones at rest and in the clip
+
+
+@dataclass(frozen=True, eq=False)
+class Retargeted:
+    """A motion with the joints of the rig from which it was made."""
+
+    motion: Motion
+    """The motion of the skeleton."""
+    source: Array
+    """[T, K, 3], places of the rig's joints in the world of the motion, metres."""
+    source_parents: tuple[int, ...]
+    """K parents, -1 for a root."""
+    pairs: dict[int, int]
+    """Per paired joint of the skeleton, the joint of the rig."""
 
 
 def choose_clip(rig: Rig, clip: str | int | None, path: Path) -> RigClip:
@@ -75,6 +89,21 @@ def retarget(
     rest: str = "auto",
     mapping: str | Path | Mapping[str, str | None] | None = None,
 ) -> Motion:
+    """Return the motion that `retarget_rig` makes of a clip."""
+    return retarget_rig(rig, clip, skeleton, path=path, name=name, up=up, rest=rest, mapping=mapping).motion
+
+
+def retarget_rig(
+    rig: Rig,
+    clip: RigClip,
+    skeleton: Skeleton,
+    *,
+    path: Path,
+    name: str,
+    up: Up = "auto",
+    rest: str = "auto",
+    mapping: str | Path | Mapping[str, str | None] | None = None,
+) -> Retargeted:
     """Convert a clip of a rig to poses of a skeleton.
 
     The bones of arms, legs and fingers get the directions of the file; for skeletons that are not human, all bones do. Trunk,
@@ -114,7 +143,8 @@ def retarget(
     if not np.isfinite(rig.rest).all():
         raise UserError(f"{path} has NaN or infinity in its rest pose; export it again")
     moved = {joint: turned(rig, clip, number, path) for joint, number in pairs.items()}
-    turns = _turns(match, moved, clip.world_from_joint[..., :3, 3], rest, path)
+    posed = clip.world_from_joint[..., :3, 3]
+    turns = _turns(match, moved, posed, rest, path)
     axis = _up(Rotation.from_matrix(moved[0] @ turns[0]), turns[0]) if up == "auto" else up
     if up == "auto" and axis == "z":
         log.info("%s: z is up in this file and was turned to y", path.name)
@@ -122,10 +152,12 @@ def retarget(
 
     rotations = {joint: upright @ moved[joint] @ turns[joint] for joint in pairs}
     poses = _local_poses(rotations, skeleton.parents, len(clip.world_from_joint))
-    translation = _translation(match, clip, rotations[0], upright)
+    with np.errstate(over="ignore", invalid="ignore"):
+        source = _scale(match, posed) * posed @ upright.T
+    translation = _translation(match, source, rotations[0])
     if not np.abs(translation).max() < _MAX_DISTANCE_M:
         raise UserError(f"{path}: the body moves over {_MAX_DISTANCE_M / 1000:g} km away; check the track of its root")
-    return Motion(name, poses, translation, clip.frame_rate)
+    return Retargeted(Motion(name, poses, translation, clip.frame_rate), source, rig.parents, pairs)
 
 
 def _turns(match: RestMatch, moved: Mapping[int, Array], posed: Array, rest: str, path: Path) -> dict[int, Array]:
@@ -178,23 +210,17 @@ def _up(upright: Rotation, rest: Array) -> Up:
     return up_axis(upright if max(abs(mean[1]), abs(mean[2])) > 0.7 else Rotation.from_matrix(rest[None]))
 
 
-def _translation(match: RestMatch, clip: RigClip, root_world: Array, upright: Array) -> Array:
-    """Return the translation that puts the middle of the hips where the scaled file has it.
+def _translation(match: RestMatch, source: Array, root_world: Array) -> Array:
+    """Return the translation [T, 3], metres, that puts the middle of the hips where the scaled rig has it.
 
     Args:
         match: the paired joints.
-        clip: the motion.
+        source: [T, K, 3], places of the rig's joints in the world of the motion, metres.
         root_world: [T, 3, 3], world rotations of the root of the skeleton.
-        upright: [3, 3], rotation of the world to y up.
-
-    Returns:
-        [T, 3], metres.
     """
     hips = [match.parts[part] for part in ("l_hip", "r_hip") if match.parts.get(part) in match.pairs]
     hips = hips if len(hips) == 2 else [0]
-    place = clip.world_from_joint[..., :3, 3][:, [match.pairs[joint] for joint in hips]].mean(1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        place = _scale(match, clip.world_from_joint[..., :3, 3]) * place @ upright.T
+    place = source[:, [match.pairs[joint] for joint in hips]].mean(1)
     root = match.target[0]
     return place - root_world @ (match.target[hips].mean(0) - root) - root
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from snarfcli.datasets.skeleton_files import PoseFile, SkeletonFile
 from snarfcli.errors import UserError
 from snarfcli.formats.bvh import read_bvh
-from snarfcli.formats.gltf import read_gltf
+from snarfcli.formats.gltf import GLTF_SUFFIXES, read_gltf
 from snarfcli.formats.rig import Rig, RigMesh
 
 __all__ = ["RIG_SUFFIXES", "RiggedFiles", "bvh_poses", "bvh_skeleton", "read_rigged_files"]
 
-RIG_SUFFIXES = (".glb", ".gltf")
+RIG_SUFFIXES = GLTF_SUFFIXES
 """Suffixes of files that can have a skeleton, a skin and animations."""
 
 _SAME_PLACE = 0.01  # share of the skeleton's size; if rest joints differ by more, the skeletons differ

@@ -10,6 +10,7 @@ from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
 from snarfcli.formats.rig import Rig
+from snarfcli.motions.humanoid import humanoid_parts
 from snarfcli.motions.joint_names import BodyParts, find_body_parts, plain_name
 
 __all__ = ["map_joints"]
@@ -24,7 +25,8 @@ def map_joints(
     """Return the index of the rig's joint that moves each joint of the skeleton; joints without one are left out.
 
     If the rig has every name of the skeleton, joints are paired by name. Otherwise they are paired as parts of a human body,
-    the joints of the spine from both ends, and the remaining joints by name. `mapping` overrides both.
+    which a VRM file names itself, the joints of the spine from both ends, and the remaining joints by name. `mapping` overrides
+    both.
 
     Args:
         skeleton: the target.
@@ -41,7 +43,8 @@ def map_joints(
     if all(name in exact for name in skeleton.names):
         pairs = {joint: exact[name] for joint, name in enumerate(skeleton.names)}
     else:
-        target, source = find_body_parts(skeleton.names, skeleton.parents), find_body_parts(rig.names, rig.parents)
+        target = find_body_parts(skeleton.names, skeleton.parents)
+        source = humanoid_parts(rig) or find_body_parts(rig.names, rig.parents)
         pairs = _pair_parts(target, source)
         for joint, name in enumerate(skeleton.names):
             number = sources.find(name)

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.errors import UserError, nearest
+from snarfcli.formats.gltf import GLTF_SUFFIXES
 from snarfcli.formats.rig import Rig, RigClip
 from snarfcli.motions.joint_names import find_body_parts
 from snarfcli.motions.layouts import layout_of
@@ -102,7 +103,7 @@ def retarget(
     parts = find_body_parts(skeleton.names, skeleton.parents)
     joints_rest = skeleton.joints_rest.detach().cpu().double().numpy()
     straightened = _straightened(rig, skeleton, pairs)
-    if up == "auto" and straightened is not rig and path.suffix.lower() in (".glb", ".gltf"):
+    if up == "auto" and straightened is not rig and path.suffix.lower() in GLTF_SUFFIXES:
         up = "y"  # the file was exported for this skeleton, so it follows the format; a lying body would mislead the guess
     rig = straightened
     match = RestMatch(pairs, parts.joints, parts.spine, joints_rest, rig.rest[:, :3, 3], skeleton.parents, rig.parents)

@@ -2,7 +2,7 @@
 
 A subject is in `<data_root>/meshes`, or in the folder `data.folder`, in one of four forms.
 
-One rigged file (glTF) with skeleton, skin and animations, each of which is a sequence:
+One rigged file (glTF, also VRM) with skeleton, skin and animations, each of which is a sequence:
 
     fox.glb
 
@@ -24,8 +24,9 @@ If there is no skeleton file, the skeleton is read from the motion.bvh of a sequ
 differ between frames.
 
 Held-out sequences are listed, by name or pattern, in `fox/split.json`, or in data.test and data.ood. Otherwise, sequences whose
-names start with `ood` are out of distribution, and the last fifth of the others (at least one) is for testing. If there is only
-one sequence, the last fifth of its frames is for testing.
+names start with `ood` are out of distribution, and the last fifth of the others (at least one) is for testing; `choose_splits`
+says what is done about rest poses and sequences with the same poses. If there is only one sequence, the last fifth of its frames
+is for testing.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def bvh() -> Target:
 def gltf() -> Target:
     from toy_animal import animal_motion, make_animal
     from toy_animal_files import animal_glb
-    from toy_gltf import GltfBuilder
+    from toy_gltf import GltfBuilder, two_bones
 
     from snarfcli.formats.gltf import read_gltf
 
@@ -83,11 +83,43 @@ def gltf() -> Target:
         )
         return builder
 
+    def crowded() -> GltfBuilder:
+        """Three sets of influences, plain values beside compressed ones, a part that is hidden, and a scene of a child."""
+        builder = two_bones()
+        attributes = builder.root["meshes"][0]["primitives"][0]["attributes"]
+        for number in (1, 2):
+            attributes |= {f"JOINTS_{number}": attributes["JOINTS_0"], f"WEIGHTS_{number}": attributes["WEIGHTS_0"]}
+        packed = {"buffer": 0, "byteOffset": 8, "byteLength": 16, "byteStride": 12, "count": 8, "mode": "ATTRIBUTES"}
+        builder.root["bufferViews"][0]["extensions"] = {"EXT_meshopt_compression": packed}
+        clip = builder.root["animations"][0]
+        clip["samplers"].append({"input": clip["samplers"][0]["input"], "output": builder.array([[1, 1, 1], [0, 0, 0]])})
+        clip["channels"].append({"sampler": 1, "target": {"node": 3, "path": "scale"}})
+        builder.root["animations"] = [clip, {**clip, "name": "again"}]
+        builder.root["scenes"] = [{"nodes": [1, 4]}]
+        return builder
+
     def seeds() -> list[bytes]:
         animal = animal_glb(make_animal(0.08), [animal_motion("walk", 3), animal_motion("sit", 2)])
-        return [animal, robot().glb(), robot().gltf()]
+        return [animal, robot().glb(), robot().gltf(), crowded().glb()]
 
     return Target("gltf", ".glb", seeds, read_gltf, _with_broken_json)
+
+
+@_target
+def vrm() -> Target:
+    """Characters and animations with a table of bones, read as motions."""
+    import numpy as np
+    from toy_rigs import a_pose, rig_of
+    from toy_vrm import human_vrm
+
+    from snarfcli.motions import read_motion
+
+    def seeds() -> list[bytes]:
+        rig = rig_of(np.stack([a_pose(), 0.5 * a_pose()]), np.zeros((2, 3)))
+        kinds = (("VRMC_vrm", True), ("VRM", True), ("VRMC_vrm_animation", False))
+        return [human_vrm(rig, table, with_mesh=with_mesh).glb() for table, with_mesh in kinds]
+
+    return Target("vrm", ".vrm", seeds, read_motion, _with_broken_json)
 
 
 def _with_broken_json(rng: random.Random, content: bytes) -> bytes:
@@ -112,7 +144,22 @@ def _with_broken_json(rng: random.Random, content: bytes) -> bytes:
         elif action < 0.3 and isinstance(owner, list):
             owner.extend([owner[key]] * rng.choice([1, 2, 1000]))
         elif action < 0.4 and isinstance(owner, dict):
-            owner[rng.choice(["skin", "mesh", "children", "matrix", "sparse", "byteStride", "normalized", "uri"])] = owner[key]
+            owner[
+                rng.choice(
+                    [
+                        "skin",
+                        "mesh",
+                        "children",
+                        "matrix",
+                        "sparse",
+                        "byteStride",
+                        "normalized",
+                        "uri",
+                        "extensions",
+                        "humanoid",
+                    ]
+                )
+            ] = owner[key]
         else:
             owner[key] = rng.choice(nasty)
         if not root:
@@ -231,6 +278,8 @@ def surface_off() -> Target:
         ".off",
         lambda: [
             b"OFF\n4 4 6\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 2 0 3\n",
+            b"OFF4 2 0\r0 0 0\r1 0 0 1\r1 1\r0\r0 1 0\r4 0 1\r2 3\r3 0 1 2\r",
+            b"NOFF 3 1 0 0 0 0 0 0 1 1 0 0 0 0 1 0 1 0 0 0 1 3 0 1 2",
             b"COFF 4 2 0 # x\n0 0 0 1 0 0 1\n1 0 0 1 0 0 1\n1 1 0 1 0 0 1\n0 1 0 1 0 0 1\n\n4 0 1 2 3 9 9\n3 0 1 2\n",
         ],
     )
@@ -254,6 +303,15 @@ def surface_ply() -> Target:
             content = head % ((order,) + (b"double",) * 3) + faces % len(polygons)
             content += b"".join(struct.pack(f"{code}3dB", *corner, 7) for corner in corners)
             made.append(content + b"".join(struct.pack(f"{code}B{len(p)}i", len(p), *p) for p in polygons))
+            made.append(made[-1].replace(b"\n", b"\r\n" if code == ">" else b"\r", 9))
+        strips = b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+        lists = b"property uchar red\nproperty list uchar float weights\n"
+        made.append(
+            head % ((b"ascii",) + (b"float",) * 3)
+            + lists
+            + strips
+            + b"0 0 0 1 0\n1 0 0 1 2 .5 .5\n0 1 0 1 0\n0 0 1 1 0\n6 0 1 2 -1 3 1\n"
+        )
         return made
 
     return _surface_target("surface_ply", ".ply", seeds)

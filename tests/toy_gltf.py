@@ -8,8 +8,13 @@ import struct
 from typing import Any
 
 import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
 
-__all__ = ["GltfBuilder"]
+__all__ = ["BOX", "GltfBuilder", "two_bones"]
+
+BOX = trimesh.creation.box((0.2, 1.0, 0.2))
+_HALF = np.sqrt(0.5)
 
 _COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
 
@@ -52,3 +57,46 @@ class GltfBuilder:
         """Return a text file whose buffer is at `uri`, by default in the file itself."""
         uri = uri or "data:application/octet-stream;base64," + base64.b64encode(self.binary).decode()
         return json.dumps({**self.root, "buffers": [{"byteLength": len(self.binary), "uri": uri}]}).encode()
+
+
+def two_bones(indices: bool = True, **more: Any) -> GltfBuilder:
+    """A box that stands on the floor below an armature of scale 0.01 with z up, and bends in the middle.
+
+    Nodes: 0 armature, 1 upper bone, 2 something between, 3 lower bone, 4 mesh (moved, which counts for nothing).
+    """
+    builder = GltfBuilder()
+    positions = np.float32(BOX.vertices @ Rotation.from_euler("x", 90, degrees=True).as_matrix().T * 100)  # cm, z up
+    positions = positions + np.float32([0, 0, 50])
+    above = positions[:, 2:] > 50
+    corners = BOX.faces.ravel()
+    attributes = {
+        "POSITION": builder.array(positions if indices else positions[corners]),
+        "JOINTS_0": builder.array((np.where(above, 0, 1) * [[1, 0, 0, 0]])[slice(None) if indices else corners], "uint8"),
+        "WEIGHTS_0": builder.array(([[255, 0, 0, 0]] * 8 if indices else [[255, 0, 0, 0]] * 36), "uint8", normalized=True),
+    }
+    inverse = np.tile(np.eye(4), (2, 1, 1))
+    inverse[:, 2, 3] = -50, 0
+    times = builder.array([1.0, 2.0])
+    spin = [[0, 0, 0, 1], [0, 0, _HALF, _HALF]]
+    builder.root.update(
+        nodes=[
+            {"name": "armature", "scale": [0.01] * 3, "rotation": [-_HALF, 0, 0, _HALF], "children": [1]},
+            {"name": "bone", "translation": [0, 0, 50], "children": [2]},
+            {"translation": [0, 0, -20], "children": [3]},
+            {"name": "bone", "translation": [0, 0, -30]},
+            {"mesh": 0, "skin": 0, "translation": [7, 7, 7]},
+        ],
+        scenes=[{"nodes": [0, 4]}],
+        skins=[{"joints": [3, 1], "inverseBindMatrices": builder.array(inverse[::-1])}],
+        meshes=[{"primitives": [{"attributes": attributes}]}],
+        animations=[
+            {
+                "samplers": [{"input": times, "output": builder.array(spin)}],
+                "channels": [{"sampler": 0, "target": {"node": 1, "path": "rotation"}}],
+            }
+        ],
+    )
+    if indices:
+        builder.root["meshes"][0]["primitives"][0]["indices"] = builder.array(corners, "uint16")
+    builder.root.update(more)
+    return builder

@@ -16,7 +16,7 @@ class AnimateConfig(MotionSelection, AvatarSelection):
     """Settings of `snarf animate`."""
 
     pose: str | None = MISSING
-    """Motion file (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf) or folder of frames; null uses `motion`."""
+    """Motion file (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .vrma) or folder of frames; null uses `motion`."""
     motion: str | None = MISSING
     """Without a pose file: a built-in motion (SMPL) or a sequence of the samples (other skeletons); null for jumping_jacks
     or the held-out sequence."""

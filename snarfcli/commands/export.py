@@ -47,7 +47,7 @@ class ExportConfig(MotionSelection, AvatarSelection):
     """Settings of `snarf export`."""
 
     pose: list[str] | None = MISSING
-    """Motion files (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .gltf) or folders of frames; each becomes one clip."""
+    """Motion files (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .vrma) or folders of frames; each becomes one clip."""
     motion: list[str] | None = MISSING
     """Built-in motions (SMPL) or sequences of the samples (other skeletons); each becomes one clip. Without motions and pose
     files: jumping_jacks or the held-out sequence."""

@@ -91,6 +91,8 @@ def run(config: PreprocessConfig) -> None:
         log.info("subject %s of %s data, %d processes", data.subject, data.data, workers)
         for line in data.sources:
             log.info("from %s", line)
+        for line in data.warnings:
+            log.warning("%s", line)
         preprocess_subject(
             data,
             config.data_root,

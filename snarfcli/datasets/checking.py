@@ -14,6 +14,7 @@ from snarfcli.bodies import Skeleton
 from snarfcli.datasets.pose_consistency import measure_pose_consistency
 from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.sources import Request
+from snarfcli.datasets.subject_size import subject_length
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.errors import UserError, one_line
 from snarfcli.sampling import check_mesh
@@ -93,6 +94,8 @@ def check_subject(
 def _about(data: SubjectData, seen: list[ExaminedFrame]) -> Iterator[Remark]:
     for line in data.sources:
         yield Remark("from", line)
+    for line in data.warnings:
+        yield Remark("check", line, "warning")
     yield from _about_skeleton(data.skeleton)
     yield from _about_sequences(data)
     examined: list[ExaminedFrame] = []
@@ -115,6 +118,8 @@ def _about(data: SubjectData, seen: list[ExaminedFrame]) -> Iterator[Remark]:
             seen.append(examined[-1])
     if examined:
         yield from _about_meshes(examined, open_edges)
+        if data.template is None:  # else weights say what moves with the bones
+            yield from _about_surroundings(data.skeleton, examined)
         fit = _about_fit(data.skeleton, examined)
         yield fit
         if fit.kind != "problem":
@@ -170,6 +175,16 @@ def _about_meshes(seen: list[ExaminedFrame], open_edges: list[int]) -> Iterator[
     if not _PERSON_M[0] <= float(np.median(sides)) <= _PERSON_M[1]:
         text = f"{_range(sides)} m is not the size of a person, for which the settings are made; give data.scale=auto"
         yield Remark("size", text, "warning")
+
+
+def _about_surroundings(skeleton: Skeleton, seen: list[ExaminedFrame]) -> Iterator[Remark]:
+    """Yield whether the meshes show more than the subject."""
+    for entry in seen:
+        length, whole = subject_length(entry.vertices, entry.joints, skeleton.parents)
+        if length < whole:
+            text = f"{entry.label} is {whole:.2f} m long, but {length:.2f} m near the bones: a floor or other things"
+            yield Remark("surroundings", f"{text}, which would be learned as a part of the subject; cut them off", "warning")
+            return
 
 
 def _about_fit(skeleton: Skeleton, seen: list[ExaminedFrame]) -> Remark:

@@ -48,12 +48,16 @@ def subject_places(request: Request) -> dict[str, Path]:
     """Return the folder or rigged file of each subject by name; the request may also name the folder of one subject.
 
     Raises:
-        UserError: there is no folder, or a subject has both a folder and a rigged file.
+        UserError: there is no folder, or a subject has two rigged files, or both a folder and a rigged file.
     """
     folder = meshes_folder(request)
     if skeleton_files(folder):
         return {folder.absolute().name: folder}
-    files = {path.stem: path for path in files_with(folder, RIG_SUFFIXES)}
+    files: dict[str, Path] = {}
+    for path in files_with(folder, RIG_SUFFIXES):
+        other = files.setdefault(path.stem, path)
+        if other != path:
+            raise UserError(f"{folder} has both {other.name} and {path.name}; rename one of them")
     folders = {path.name: path for path in subfolders(folder) if not missing_parts(path)}
     for name in files.keys() & folders.keys():
         raise UserError(f"{folder} has both {files[name].name} and a folder {name}; rename one of them")

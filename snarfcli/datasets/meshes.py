@@ -2,7 +2,7 @@
 
 A subject is in `<data_root>/meshes`, or in the folder `data.folder`, in one of four forms.
 
-One rigged file (glTF) with skeleton, skin and animations, each of which is a sequence:
+One rigged file (glTF, also VRM) with skeleton, skin and animations, each of which is a sequence:
 
     fox.glb
 
@@ -23,9 +23,10 @@ A single sequence, whose poses and meshes are in the same folder as the skeleton
 If there is no skeleton file, the skeleton is read from the motion.bvh of a sequence. The numbers of vertices and faces may
 differ between frames.
 
-Held-out sequences are listed, by name or pattern, in `fox/split.json`, or in data.test and data.ood. Otherwise, sequences whose
-names start with `ood` are out of distribution, and the last fifth of the others (at least one) is for testing. If there is only
-one sequence, the last fifth of its frames is for testing.
+Held-out sequences are listed, by name or pattern, in `fox/split.json`, or in data.test and data.ood. Otherwise, sequences
+whose names start with `ood` are out of distribution, and the last fifth of the others (at least one) is for testing;
+`choose_splits` says what is done about rest poses and sequences with the same poses. If there is only one sequence, the last
+fifth of its frames is for testing.
 """
 
 from __future__ import annotations
@@ -57,14 +58,15 @@ from snarfcli.datasets.mesh_folders import (
 )
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
 from snarfcli.datasets.recorded_sequence import FileToWorld, RecordedSequence, person_scale
+from snarfcli.datasets.recorded_splits import choose_splits, split_patterns
 from snarfcli.datasets.rigged import bvh_poses, bvh_skeleton, read_rigged_files
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.skeleton_files import SkeletonFile, read_poses, read_skeleton
 from snarfcli.datasets.sources import Request
-from snarfcli.datasets.splits import SPLITS, Split, split_sequences
+from snarfcli.datasets.splits import SPLITS
+from snarfcli.datasets.subject_size import subject_length
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
-from snarfcli.files import read_json
 from snarfcli.formats.surfaces import list_surfaces, read_surface
 from snarfcli.names import folder_names
 
@@ -119,10 +121,14 @@ def _load_meshes(subject: str, folder: Path, config: DataConfig) -> SubjectData:
     if not recordings:
         more = f" (and {len(broken) - 1} more sequences cannot be used)" if broken[1:] else ""
         raise UserError(broken[0][1] + more)
-    scale, why = person_scale(_first_mesh(recordings), config.scale, skeleton.scale)
+    length, whole = subject_length(*_first_mesh(recordings, skeleton), skeleton.parents)
+    scale, why = person_scale(length, whole, config.scale, skeleton.scale)
     up = config.up if config.up != "auto" else skeleton.up or "y"
+    warnings = _about_angles(recordings)
     sources = (f"skeleton {source}, {len(skeleton.names)} joints", _conversion_text(why, up))
-    return _subject(subject, skeleton, FileToWorld(scale, up), recordings, folder, config, sources, broken=tuple(broken))
+    return _subject(
+        subject, skeleton, FileToWorld(scale, up), recordings, folder, config, sources, warnings, broken=tuple(broken)
+    )
 
 
 def _read_skeleton(folder: Path, sequences: list[Path]) -> tuple[Path, SkeletonFile]:
@@ -149,8 +155,21 @@ def _read_recording(name: str, folder: Path, skeleton: SkeletonFile) -> Recorded
     return RecordedSequence(name, poses, FileMeshes(meshes, read_surface, np.eye(4)))
 
 
-def _first_mesh(recordings: list[RecordedSequence]) -> NDArray:
-    """Return the vertices [V, 3], units of the file, of the first frame of a sequence, for the size of the subject.
+def _about_angles(recordings: list[RecordedSequence]) -> tuple[str, ...]:
+    """Return lines about angles that are hardly in radians, although not all frames say so."""
+    found = []
+    for recording in recordings:
+        poses = recording.poses.poses
+        largest = np.linalg.norm(poses[:, 1:], axis=-1).max(initial=0.0) if poses is not None else 0.0
+        if largest > 2 * math.pi:
+            found.append(
+                f"{recording.name}: a joint is turned by {largest:.3g}, more than a full turn; angles must be in radians"
+            )
+    return tuple(found)
+
+
+def _first_mesh(recordings: list[RecordedSequence], skeleton: SkeletonFile) -> tuple[NDArray, NDArray]:
+    """Return the vertices [V, 3] and joints [J, 3], units of the file, of the first frame of a sequence.
 
     Sequences are tried in order until one has a first mesh that can be read.
     """
@@ -159,7 +178,7 @@ def _first_mesh(recordings: list[RecordedSequence]) -> NDArray:
         try:
             vertices, _ = recording.meshes[0]
             if len(vertices) and np.isfinite(vertices).all():
-                return vertices
+                return vertices, recording.joints(0, skeleton)
         except UserError as error:
             problem = problem or error
     raise problem or UserError(f"the first meshes of all {len(recordings)} sequences are empty or not finite; repair them")
@@ -169,10 +188,13 @@ def _first_mesh(recordings: list[RecordedSequence]) -> NDArray:
 def _load_rigged(subject: str, place: Path, paths: list[Path], config: DataConfig) -> SubjectData:
     """Read a subject from rigged files; `place` is the file, or the folder with the files."""
     rigged = read_rigged_files(paths)
+    if not rigged.clips and rigged.left_out:
+        raise UserError(f"{place}: no motion can be used; {rigged.left_out[0][0]}: {rigged.left_out[0][1]}; export it again")
     if not rigged.clips:
         raise UserError(f"{place} has no animations, but an avatar is learned from them; export the file with its animations")
     skeleton, mesh = rigged.skeleton, rigged.mesh
-    scale, why = person_scale(mesh.vertices, config.scale, None)
+    length = float(np.ptp(mesh.vertices, axis=0).max())
+    scale, why = person_scale(length, length, config.scale, None)
     up = config.up if config.up != "auto" else "y"  # glTF files have y up
     world = FileToWorld(scale, up)
     vertices = world.points(mesh.vertices)
@@ -189,7 +211,8 @@ def _load_rigged(subject: str, place: Path, paths: list[Path], config: DataConfi
         sources.append(f"{len(rigged.dropped)} end joints that move no vertex were left out ({some})")
     sources.append(_conversion_text(why, up))
     template = partial(_template, vertices, mesh.faces, mesh.weights)
-    return _subject(subject, skeleton, world, recordings, place, config, tuple(sources), template=template)
+    left_out = tuple(f"motion {name} was left out: {reason}" for name, reason in rigged.left_out)
+    return _subject(subject, skeleton, world, recordings, place, config, tuple(sources), left_out, template=template)
 
 
 def _template(vertices: NDArray, faces: NDArray, weights: NDArray, skeleton: Skeleton) -> MeshTemplate:
@@ -208,6 +231,7 @@ def _subject(
     place: Path,
     config: DataConfig,
     sources: tuple[str, ...],
+    warnings: tuple[str, ...],
     *,
     template: Callable[[Skeleton], MeshTemplate] | None = None,
     broken: tuple[tuple[str, str], ...] = (),
@@ -222,24 +246,22 @@ def _subject(
         place: file or folder of the subject.
         config: settings.
         sources: lines about the origin of the data.
+        warnings: lines about what should be checked.
         template: makes the mesh in the canonical pose from the converted skeleton; None if there is no such mesh.
         broken: name of each sequence that cannot be used, and the reason.
     """
     skeleton = _world_skeleton(skeleton_file, world, config.canonical)
-    test, ood = _patterns(place, config)
-    names = sorted([*(recording.name for recording in recordings), *(name for name, _ in broken)])
-    if len(names) == 1 and not test:
-        recordings = recordings[0].split_off_test()
-        splits: dict[str, Split] = {recording.name: "test" if index else "train" for index, recording in enumerate(recordings)}
-    else:  # with the broken sequences, so that repairing their files does not change the split of the others
-        splits = split_sequences(names, test, ood)
-    specs = {recording.name: recording.to_sequence(splits[recording.name], skeleton, world) for recording in recordings}
+    test, ood = split_patterns(place, config)
+    chosen = choose_splits(recordings, (name for name, _ in broken), skeleton_file, test, ood)
+    sequences = (recording.to_sequence(chosen.splits[recording.name], skeleton, world) for recording in chosen.recordings)
+    specs = {spec.name: spec for spec in sequences}
     stretched = [name for name, spec in specs.items() if spec.posed_from_rest is not None]
     if stretched:
         sources += (f"joints stretch, scale or come apart in {', '.join(stretched[:6])}: bone transforms are kept as given",)
     ordered = sorted(specs.values(), key=lambda spec: SPLITS.index(spec.split))
     mesh = template(skeleton) if template is not None else None
-    return SubjectData("meshes", subject, skeleton, tuple(ordered), mesh, sources=sources, broken=broken)
+    sources, warnings = (*sources, *chosen.facts), (*warnings, *chosen.warnings)
+    return SubjectData("meshes", subject, skeleton, tuple(ordered), mesh, sources=sources, warnings=warnings, broken=broken)
 
 
 def _world_skeleton(file: SkeletonFile, world: FileToWorld, canonical: str) -> Skeleton:
@@ -253,23 +275,6 @@ def _world_skeleton(file: SkeletonFile, world: FileToWorld, canonical: str) -> S
     elif canonical == "auto" and file.canonical_pose is not None:
         pose = torch.from_numpy(world.angles(file.canonical_pose))
     return Skeleton(file.names, file.parents, rest, pose)
-
-
-def _patterns(place: Path, config: DataConfig) -> tuple[list[str], list[str]]:
-    """Return the patterns of test and of out-of-distribution sequences from the settings, or else from `split.json`.
-
-    A list `train` in the file is allowed, but not used: all other sequences are for training.
-    """
-    path = place / "split.json"  # does not exist if `place` is a file
-    content = read_json(path, "split") if path.is_file() else {}
-    if not isinstance(content, dict) or not set(content) <= {"test", "ood", "train"}:
-        raise UserError(
-            f'split {path}: wanted an object such as {{"test": ["walk"], "ood": ["jump*"]}}, got another; repair it'
-        )
-    for name, patterns in content.items():
-        if not isinstance(patterns, list) or not all(isinstance(pattern, str) for pattern in patterns):
-            raise UserError(f"split {path}: {name}: wanted a list of names, got another value; repair it")
-    return config.test or content.get("test", []), config.ood or content.get("ood", [])
 
 
 def _conversion_text(why: str, up: str) -> str:

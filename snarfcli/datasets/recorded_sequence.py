@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from snarfcli.bodies import pose_from_transforms
+from snarfcli.bodies import forward_kinematics, pose_from_transforms
 from snarfcli.bodies.skeleton import Skeleton
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
-from snarfcli.datasets.skeleton_files import PoseFile
+from snarfcli.datasets.skeleton_files import PoseFile, SkeletonFile
 from snarfcli.datasets.splits import Split, held_back_start
 from snarfcli.datasets.subjects import SequenceSpec
 from snarfcli.motions import Motion
@@ -73,6 +73,20 @@ class RecordedSequence:
     meshes: FileMeshes | RigMeshes
     """The mesh of every frame: files, which are converted when they are read, or a rig that is already converted."""
 
+    def bone_transforms(self, frames: NDArray[np.int64], skeleton: SkeletonFile) -> NDArray[np.float64]:
+        """Return the transforms [K, J, 4, 4] of the bones from rest to the frames with these indices [K], units of the file."""
+        if self.poses.posed_from_rest is not None:
+            return self.poses.posed_from_rest[frames]
+        if self.poses.poses is None or self.poses.translation is None:
+            raise ValueError(f"{self.name}: wanted bone transforms, or poses with a translation, got neither")
+        poses, translation = (torch.from_numpy(array[frames]) for array in (self.poses.poses, self.poses.translation))
+        return forward_kinematics(poses, torch.from_numpy(skeleton.joints_rest), skeleton.parents, translation)[1].numpy()
+
+    def joints(self, frame: int, skeleton: SkeletonFile) -> NDArray[np.float64]:
+        """Return the joints [J, 3] in a frame, units of the file."""
+        moved = self.bone_transforms(np.array([frame]), skeleton)[0]
+        return np.einsum("jab,jb->ja", moved[:, :3, :3], skeleton.joints_rest) + moved[:, :3, 3]
+
     def to_sequence(self, split: Split, skeleton: Skeleton, world: FileToWorld) -> SequenceSpec:
         """Return the converted sequence; bone transforms are kept only if the poses do not reproduce them."""
         poses, posed_from_rest = self.poses, None
@@ -109,20 +123,21 @@ class RecordedSequence:
         return RecordedSequence(name, poses, replace(self.meshes, posed_from_rest=self.meshes.posed_from_rest[frames]))
 
 
-def person_scale(vertices: NDArray, wanted: str, given: float | None) -> tuple[float, str]:
+def person_scale(length: float, whole: float, wanted: str, given: float | None) -> tuple[float, str]:
     """Return the metres per unit, and the reason as text.
 
     Args:
-        vertices: [V, 3], vertices of a mesh, units of its file.
+        length: longest side of the subject, units of its file.
+        whole: longest side of its mesh, units of its file; larger than `length` if the mesh shows more than the subject.
         wanted: the setting data.scale: auto, or a positive number.
         given: scale of the skeleton file; None if it has none.
     """
-    length = float(np.ptp(vertices, axis=0).max())
     if wanted != "auto":
         return float(wanted), f"scaled by {float(wanted):g} (data.scale): {float(wanted) * length:.2f} m long"
     if given is not None:
         return given, f"scaled by {given:g} (its file): {given * length:.2f} m long"
+    part = f" near the bones, the whole mesh {whole:.4g} units" if whole > length else ""
     if _NEAR_A_PERSON_M[0] <= length <= _NEAR_A_PERSON_M[1] or not length > 0:
-        return 1.0, f"not scaled: {length:.2f} m long"
+        return 1.0, f"not scaled: {length:.2f} m long{part}" + ("; data.scale=NUMBER sets it" if part else "")
     scale = PERSON_M / length
-    return scale, f"scaled by {scale:.4g}, so {length:.4g} units become {PERSON_M} m; data.scale=NUMBER sets it"
+    return scale, f"scaled by {scale:.4g}, so {length:.4g} units{part} become {PERSON_M} m; data.scale=NUMBER sets it"

@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from snarfcli.datasets.skeleton_files import PoseFile, SkeletonFile
 from snarfcli.errors import UserError
 from snarfcli.formats.bvh import read_bvh
-from snarfcli.formats.gltf import read_gltf
+from snarfcli.formats.gltf import GLTF_SUFFIXES, read_gltf
 from snarfcli.formats.rig import Rig, RigMesh
 
 __all__ = ["RIG_SUFFIXES", "RiggedFiles", "bvh_poses", "bvh_skeleton", "read_rigged_files"]
 
-RIG_SUFFIXES = (".glb", ".gltf")
+RIG_SUFFIXES = GLTF_SUFFIXES
 """Suffixes of files that can have a skeleton, a skin and animations."""
 
+_LEAST_SCALE = 0.01  # of a joint, as a share of the largest; artists squash parts to 0.2, and hide them by less than 0.001
 _SAME_PLACE = 0.01  # share of the skeleton's size; if rest joints differ by more, the skeletons differ
 
 
@@ -35,6 +36,8 @@ class RiggedFiles:
     """Name and bone transforms of each motion."""
     dropped: tuple[str, ...]
     """Names of the end joints without vertices, which were left out."""
+    left_out: tuple[tuple[str, str], ...]
+    """Name of each motion that cannot be used, and the reason."""
 
 
 def read_rigged_files(paths: Sequence[Path]) -> RiggedFiles:
@@ -52,8 +55,9 @@ def read_rigged_files(paths: Sequence[Path]) -> RiggedFiles:
         raise UserError(f"{paths[0]} has no mesh that its joints move; export it with its skin, or give meshes as files")
     path, first, whole = skinned
     kept = _moving_joints(first, whole.weights)
-    clips = []
+    clips, left_out = [], []
     for other, rig in rigs.items():
+        left_out += rig.left_out
         if not rig.clips:
             continue
         columns = _same_joints(path, first, other, rig, kept)
@@ -63,10 +67,15 @@ def read_rigged_files(paths: Sequence[Path]) -> RiggedFiles:
                 name = other.stem if len(rig.clips) == 1 else f"{other.stem}_{clip.name}"
             # The bind pose is that of the file with the mesh; the rest poses of the others do not matter.
             moved = clip.world_from_joint[:, columns] @ np.linalg.inv(first.rest[kept])
-            clips.append((name, PoseFile(clip.frame_rate, posed_from_rest=moved)))
+            hidden = _hidden(moved)
+            if hidden is None:
+                clips.append((name, PoseFile(clip.frame_rate, posed_from_rest=moved)))
+            else:
+                joint = first.names[kept[hidden[1]]]
+                left_out.append((name, f"joint {joint!r:.60} has scale 0 in frame {hidden[0]}, so a part of the mesh vanishes"))
     dropped = tuple(name for joint, name in enumerate(first.names) if joint not in set(kept.tolist()))
     mesh = RigMesh(whole.vertices, whole.faces, whole.weights[:, kept])
-    return RiggedFiles(_skeleton(first, kept), mesh, tuple(clips), dropped)
+    return RiggedFiles(_skeleton(first, kept), mesh, tuple(clips), dropped, tuple(left_out))
 
 
 def bvh_skeleton(path: Path) -> SkeletonFile:
@@ -125,6 +134,13 @@ def _moving_joints(rig: Rig, weights: NDArray[np.float64]) -> NDArray[np.int64]:
         if needed[joint] and rig.parents[joint] >= 0:
             needed[rig.parents[joint]] = True
     return np.flatnonzero(needed)
+
+
+def _hidden(moved: NDArray[np.float64]) -> tuple[int, int] | None:
+    """Return frame and joint of the first of the transforms [T, J, 4, 4] that shrinks a part to almost nothing; or None."""
+    sizes = np.linalg.svd(moved[..., :3, :3], compute_uv=False)[..., -1]
+    found = np.argwhere(sizes < _LEAST_SCALE * sizes.max(initial=0.0))
+    return (int(found[0, 0]), int(found[0, 1])) if len(found) else None
 
 
 def _without_ends(rig: Rig) -> NDArray[np.int64]:

@@ -27,12 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.datasets.named_values import NamedValues
+from snarfcli.motions.angles import angle_problem
 
 __all__ = ["DEFAULT_FRAME_RATE", "PoseFile", "SkeletonFile", "read_poses", "read_skeleton"]
 
 DEFAULT_FRAME_RATE = 30.0
 """Frames per second of pose files without a frame rate."""
 
+_FULL_TURN = 2 * np.pi  # radians; no joint is turned further in one pose
 _MAX_JOINTS = 1000  # SMPL-X has 55, a character with fingers and face about 200; each needs weights at every point
 _ALIASES = {
     "names": ("names", "joint_names"),
@@ -110,7 +112,12 @@ def read_skeleton(path: str | Path) -> SkeletonFile:
     order = _parents_first(content, numbers)
     place = {joint: number for number, joint in enumerate(order)}
     chosen = np.array(order)
-    canonical = content.numbers("canonical_pose", (count, 3))[chosen] if content.get("canonical_pose") is not None else None
+    canonical = None
+    if content.get("canonical_pose") is not None:
+        canonical = content.numbers("canonical_pose", (count, 3))[chosen]
+        largest = np.linalg.norm(canonical, axis=1).max()
+        if largest > _FULL_TURN:
+            content.fail(f"canonical_pose: wanted angles in radians, got {largest:.5g}; save them in radians")
     up = content.text("up")
     if up not in (None, "y", "z"):
         content.fail(f"up: wanted y or z, got {up!r:.40}; repair it")
@@ -146,6 +153,9 @@ def read_poses(path: str | Path, order: NDArray[np.int64]) -> PoseFile:
     poses = content.numbers("poses", (None, count, 3))
     if not len(poses):
         content.fail("wanted at least 1 frame, got 0; give another file")
+    problem = angle_problem(poses)
+    if problem:
+        content.fail(f"poses: {problem}")
     translation = np.zeros((len(poses), 3))
     if content.get("trans") is not None:
         translation = content.numbers("trans", (None, 3))

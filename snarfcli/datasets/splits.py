@@ -28,7 +28,15 @@ def held_back_start(num_frames: int) -> int:
     return num_frames - max(1, round(_TEST_SHARE * num_frames))
 
 
-def split_sequences(names: Sequence[str], test: Sequence[str], ood: Sequence[str], *, fewest: int = 2) -> dict[str, Split]:
+def split_sequences(
+    names: Sequence[str],
+    test: Sequence[str],
+    ood: Sequence[str],
+    *,
+    fewest: int = 2,
+    alike: Sequence[Sequence[str]] = (),
+    still: Sequence[Sequence[str]] = (),
+) -> dict[str, Split]:
     """Return the split of each sequence.
 
     Sequences that match a pattern of `test` or `ood` are held out. Without patterns, names that start with `ood` are out of
@@ -39,6 +47,9 @@ def split_sequences(names: Sequence[str], test: Sequence[str], ood: Sequence[str
         test: names or patterns of sequences for testing; the last match of a pattern counts.
         ood: names or patterns of out-of-distribution sequences.
         fewest: of fewer other sequences, none is for testing without a pattern; the caller can hold back a part of each.
+        alike: groups of sequences that count as one: without a pattern, all of a group are in the same split.
+        still: lists of sequences that are for training without a pattern; a later list counts as others if too few others are
+            left.
 
     Raises:
         UserError: a pattern matches no sequence, or no sequence is left to train on.
@@ -53,16 +64,32 @@ def split_sequences(names: Sequence[str], test: Sequence[str], ood: Sequence[str
             chosen.update(dict.fromkeys(matches, split))
     if not ood:
         chosen.update({name: "ood" for name in names if name not in chosen and name.lower().startswith("ood")})
-    left = [name for name in names if name not in chosen]
-    if not test and len(left) >= fewest:
-        count = max(1, round(_TEST_SHARE * len(left)))
-        chosen.update(dict.fromkeys(left[-count:], "test"))
+    if not test:
+        left = [name for name in names if name not in chosen]
+        chosen.update(dict.fromkeys(_last_groups(left, alike, still, fewest), "test"))
     if not set(names) - set(chosen):
         by_name = "" if ood else " (without data.ood, names that start with ood are)"
         raise UserError(
             f"no sequence is left to train on: {_listed(names)} are all held out{by_name}; name fewer in data.test and data.ood"
         )
     return {name: chosen.get(name, "train") for name in names}
+
+
+def _last_groups(
+    names: Sequence[str], alike: Sequence[Sequence[str]], still: Sequence[Sequence[str]], fewest: int
+) -> list[str]:
+    """Return the last fifth of the sequences, or of groups of them."""
+    for number in range(len(still), -1, -1):
+        left_out = {name for names in still[:number] for name in names}
+        group_of = {name: tuple(group) for group in alike for name in group}
+        moving = [name for name in names if name not in left_out]
+        groups = list(dict.fromkeys(group_of.get(name, (name,)) for name in moving))
+        if len(groups) >= fewest:
+            count = max(1, round(_TEST_SHARE * len(groups)))
+            return [name for group in groups[-count:] for name in group if name in names]
+        if groups:
+            break
+    return []
 
 
 def _listed(names: Sequence[str]) -> str:

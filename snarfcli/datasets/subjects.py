@@ -56,6 +56,8 @@ class SubjectData:
     """Name of each sequence that cannot be used, and the reason."""
     is_planar: bool = False
     """Whether the subject is two-dimensional: its meshes are prisms along z, and only the plane z = 0 is sampled."""
+    warnings: tuple[str, ...] = ()
+    """What should be checked before training; printed."""
 
     def of_split(self, split: Split) -> tuple[SequenceSpec, ...]:
         """Return the sequences of one split."""

@@ -1,4 +1,4 @@
-"""Read glTF 2.0 files (`.glb`, `.gltf`): skinned characters, robots of rigid parts, and static meshes.
+"""Read glTF 2.0 files (`.glb`, `.gltf`, VRM's `.vrm` and `.vrma`): skinned characters, robots of rigid parts, static meshes.
 
 Source: Khronos, glTF 2.0 specification.
 """
@@ -6,35 +6,35 @@ Source: Khronos, glTF 2.0 specification.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.formats.gltf_clips import printable_names, sample_clips
 from snarfcli.formats.gltf_file import GltfFile
+from snarfcli.formats.gltf_humanoid import read_humanoid
 from snarfcli.formats.gltf_mesh import MeshReader, Piece, dense_weights, join_pieces, moved, welded
 from snarfcli.formats.gltf_motion import GltfAnimation, read_animations
 from snarfcli.formats.gltf_nodes import NodeTree, ShownMesh
 from snarfcli.formats.gltf_place import placed_skins
 from snarfcli.formats.gltf_skin import Skin, check_transforms, read_used_skins
-from snarfcli.formats.rig import Rig, RigClip, RigMesh
-from snarfcli.names import unique_names
+from snarfcli.formats.rig import Rig, RigMesh
 
-__all__ = ["read_gltf", "read_gltf_surface"]
+__all__ = ["GLTF_SUFFIXES", "read_gltf", "read_gltf_surface"]
+
+GLTF_SUFFIXES = (".glb", ".gltf", ".vrm", ".vrma")
+"""Suffixes of glTF files with joints, in lower case; those of VRM are `.glb` files with a table of the body's bones."""
 
 log = logging.getLogger(__name__)
 
-# Transforms of nodes in one clip, and of joints in all clips, 128 bytes each.
-_MAX_NODE_FRAMES = 1_500_000
-_MAX_JOINT_FRAMES = 2_000_000
-_NODE_COST = 20  # frames; a node costs as much even if it does not move
+_LISTED = 4  # clips in a message
 
 
 def read_gltf(path: str | Path, *, frame_rate: float | None = None) -> Rig:
-    """Read the joints, the motions and the mesh of a `.glb` or `.gltf` file.
+    """Read the joints, the motions and the mesh of a file ending in one of `GLTF_SUFFIXES`.
 
     Frames. The joint of a skin moves a stored vertex by `world_from_joint(t) @ inverse_bind`; the transform of the node that
     holds a skinned mesh is ignored (glTF 2.0, 3.7.3.3). The frame in which a mesh is stored is the exporter's choice: often the
@@ -49,6 +49,8 @@ def read_gltf(path: str | Path, *, frame_rate: float | None = None) -> Rig:
       unskinned meshes are left out. Vertices that were split along seams are welded if position and weights are bitwise equal.
       Morph targets, materials and textures are ignored.
     - In a file without skins, each node that has or moves a mesh becomes a joint, and the mesh follows it rigidly.
+    - The bones of a humanoid in a VRM file become joints in any case; without skin and mesh (`.vrma`), they alone.
+    - Damaged animations are left out, unless all are. A joint that an animation hides by the scale 0 has the scale 1e-4 there.
 
     Args:
         path: the file; its buffers lie inside it or beside it.
@@ -57,27 +59,30 @@ def read_gltf(path: str | Path, *, frame_rate: float | None = None) -> Rig:
 
     Raises:
         UserError: the file is missing, damaged, compressed (Draco, meshopt) or too large, contains nothing that moves, or has
-            joints of scale zero.
+            only joints of scale zero.
         ValueError: `frame_rate` is not positive.
     """
     if frame_rate is not None and not frame_rate > 0:
         raise ValueError(f"frame_rate: wanted a positive number, got {frame_rate}")
     file = GltfFile(path)
     tree = NodeTree(file)
-    animations = read_animations(file, frame_rate)
+    animations, damaged = read_animations(file, frame_rate)
     meshes = tree.shown_meshes()
     skins = read_used_skins(file, meshes)
+    humanoid = read_humanoid(file)
     with np.errstate(all="ignore"):  # overflow is found by check_transforms
-        joints, parents = _sorted_joints(tree, _find_joints(file, tree, skins, meshes, animations))
-        names = _unique((tree.nodes[joint].get("name") for joint in joints), "joint")
+        joints, parents = _sorted_joints(tree, _find_joints(file, tree, skins, meshes, animations, humanoid))
+        names = printable_names((tree.nodes[joint].get("name") for joint in joints), "joint")
         relevant = tree.with_ancestors([*joints, *(mesh.node for mesh in meshes)])
-        here = {node: world[0] for node, world in tree.worlds(relevant).items()}
-        check_transforms(file, np.stack([here[joint] for joint in joints]), names, "")
-        rest, pieces = _rest_and_pieces(file, tree, skins, meshes, joints, here)
+        here, hidden = _worlds_by_default(file, tree, relevant, joints, names)
+        rest, pieces = _rest_and_pieces(file, tree, skins, meshes, joints, here, hidden)
         check_transforms(file, rest, names, " at rest")
-        clips = _sample_clips(file, tree, animations, joints, names)
+        clips, unusable = sample_clips(file, tree, animations, joints, names)
         mesh = _rig_mesh(file, pieces, len(joints))
-    return Rig(names, parents, rest, clips, mesh)
+    left_out = (*damaged, *unusable)
+    _report_left_out(file, left_out, len(clips))
+    place = {node: joint for joint, node in enumerate(joints)}
+    return Rig(names, parents, rest, clips, mesh, {bone: place[node] for bone, node in humanoid.items()}, left_out)
 
 
 def read_gltf_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -121,36 +126,53 @@ def _posed(piece: Piece, matrices: NDArray[np.float64]) -> Piece:
 
 
 def _find_joints(
-    file: GltfFile, tree: NodeTree, skins: dict[int, Skin], meshes: list[ShownMesh], animations: list[GltfAnimation]
+    file: GltfFile,
+    tree: NodeTree,
+    skins: dict[int, Skin],
+    meshes: list[ShownMesh],
+    animations: list[GltfAnimation],
+    humanoid: dict[str, int],
 ) -> list[int]:
-    """Return the nodes that become joints: those of the skins; without skins, those that hold or move a mesh."""
+    """Return the nodes that become joints: those of skins and humanoid; without skins, also those that hold or move a mesh."""
+    bones = list(humanoid.values())
     if skins:
-        return list(dict.fromkeys(joint for skin in skins.values() for joint in skin.joints))
+        return list(dict.fromkeys([*(joint for skin in skins.values() for joint in skin.joints), *bones]))
     holders = {mesh.node for mesh in meshes}
-    moving = {node for animation in animations for node in animation.nodes}
-    joints = [node for node in tree.with_ancestors(holders or moving) if node in holders or node in moving]
+    # Other nodes of an animation without a mesh hold expressions or the direction of the eyes.
+    moving = {node for animation in animations for node in animation.nodes} if holders or not bones else set()
+    wanted = {*holders, *moving, *bones}
+    joints = [node for node in tree.with_ancestors([*(holders or moving), *bones]) if node in wanted]
     if not joints:
         file.fail("has no skin, no mesh and no animation; give the file of a rigged character")
     return joints
 
 
-def _sample_clips(
-    file: GltfFile, tree: NodeTree, animations: list[GltfAnimation], joints: list[int], names: tuple[str, ...]
-) -> tuple[RigClip, ...]:
-    """Return the world transforms of the joints in each animation."""
-    relevant, joint_frames, clips = tree.with_ancestors(joints), 0, []
-    clip_names = _unique((animation.name for animation in animations), "clip")
-    for name, animation in zip(clip_names, animations, strict=True):
-        joint_frames += (animation.num_frames + _NODE_COST) * len(joints)
-        if (animation.num_frames + _NODE_COST) * len(relevant) > _MAX_NODE_FRAMES or joint_frames > _MAX_JOINT_FRAMES:
-            file.fail(f"its animations have too many frames for {len(relevant)} nodes; export fewer, or cut them")
-        worlds = tree.worlds(relevant, animation.nodes)
-        poses = np.empty((animation.num_frames, len(joints), 4, 4))
-        for column, joint in enumerate(joints):
-            poses[:, column] = worlds[joint]
-        check_transforms(file, poses, names, f" in clip {name}")
-        clips.append(RigClip(name, animation.frame_rate, poses))
-    return tuple(clips)
+def _worlds_by_default(
+    file: GltfFile, tree: NodeTree, relevant: list[int], joints: list[int], names: tuple[str, ...]
+) -> tuple[dict[int, NDArray[np.float64]], set[int]]:
+    """Return the transforms [4, 4] from nodes to the world, and the joints that are hidden by the scale 0.
+
+    Raises:
+        UserError: all joints have the scale 0, or a transform is not finite.
+    """
+    stored = {node: world[0] for node, world in tree.worlds(relevant).items()}
+    hidden = {joint for joint in joints if np.linalg.det(stored[joint][:3, :3]) == 0}
+    if len(hidden) in (0, len(joints)):
+        check_transforms(file, np.stack([stored[joint] for joint in joints]), names, "")
+        return stored, hidden
+    here = {node: world[0] for node, world in tree.worlds(relevant, keep_zero=False).items()}
+    check_transforms(file, np.stack([here[joint] for joint in joints]), names, "")
+    return here, hidden
+
+
+def _report_left_out(file: GltfFile, left_out: Sequence[tuple[str, str]], num_clips: int) -> None:
+    """Log the clips that were left out; raise UserError if there are no others."""
+    if not left_out:
+        return
+    if not num_clips:
+        file.fail(left_out[0][1])
+    shown = "; ".join(f"{name[:40]!a}: {reason}" for name, reason in left_out[:_LISTED])
+    log.warning("%s: %d motions cannot be used and were left out (%s)", file.path.name, len(left_out), shown)
 
 
 def _rig_mesh(file: GltfFile, pieces: list[Piece], num_joints: int) -> RigMesh | None:
@@ -196,6 +218,7 @@ def _rest_and_pieces(
     meshes: list[ShownMesh],
     joints: list[int],
     here: dict[int, NDArray[np.float64]],
+    hidden: set[int],
 ) -> tuple[NDArray[np.float64], list[Piece]]:
     """Return the transforms [J, 4, 4] of the joints at rest, and all triangles at rest, which follow indices into `joints`.
 
@@ -206,9 +229,10 @@ def _rest_and_pieces(
         meshes: the meshes of the default scene.
         joints: J node indices.
         here: [4, 4] per node, transform from the node to the world by default.
+        hidden: joints whose scale is 0 by default.
     """
     column = {joint: number for number, joint in enumerate(joints)}
-    world_from_bind, rest = placed_skins(skins, here)
+    world_from_bind, rest = placed_skins(skins, here, hidden)
     if world_from_bind.keys() < skins.keys():
         log.warning(
             "%s: two skins have different rest transforms for the same joint; only the mesh of the first skin is used",
@@ -235,12 +259,3 @@ def _rest_and_pieces(
     if left_out:
         log.info("%s: %d meshes without a joint were left out", file.path.name, left_out)
     return np.stack([rest[joint] for joint in joints]), pieces
-
-
-def _unique(names: Iterable[Any], what: str) -> tuple[str, ...]:
-    """Return the names as unique, printable text; items that are not text get the name `<what>_<index>`."""
-    found = []
-    for number, name in enumerate(names):
-        name = "".join(letter if letter.isprintable() else "_" for letter in name[:100]) if isinstance(name, str) else ""
-        found.append(name or f"{what}_{number}")
-    return tuple(unique_names(found))

@@ -24,11 +24,8 @@ _MAGIC = 0x46546C67  # "glTF"
 _CHUNK_JSON, _CHUNK_BINARY = 0x4E4F534A, 0x004E4942
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_COMPRESSED = {
-    "KHR_draco_mesh_compression": "Draco",
-    "EXT_meshopt_compression": "meshopt",
-    "KHR_meshopt_compression": "meshopt",
-}
+_MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+_COMPRESSED = {"KHR_draco_mesh_compression": "Draco", **dict.fromkeys(_MESHOPT, "meshopt")}
 
 # Together these limit any file to a few seconds and well under 1 GiB, independent of what it declares.
 _MAX_BINARY = 2**29  # bytes, textures included
@@ -67,6 +64,10 @@ class GltfFile:
     def fail(self, message: str) -> NoReturn:
         """Raise a `UserError` that names the file."""
         raise UserError(f"glTF file {self.path}: {message}")
+
+    def reason(self, error: UserError) -> str:
+        """Return the message of `fail` without the name of the file, for a list of parts that were left out."""
+        return str(error).removeprefix(f"glTF file {self.path}: ")
 
     def _unwrap(self, content: bytes) -> bytes:
         """Return the JSON of a GLB container, and keep its binary chunk."""
@@ -129,8 +130,12 @@ class GltfFile:
 
     def has_extension(self, owner: dict[str, Any], *names: str) -> bool:
         """Return whether `owner` uses one of the extensions `names`."""
-        extensions = owner.get("extensions")
-        return isinstance(extensions, dict) and any(name in extensions for name in names)
+        return any(name in _extensions(owner) for name in names)
+
+    def extension(self, name: str) -> dict[str, Any]:
+        """Return the extension `name` of the whole file; empty if the file does not have it."""
+        found = _extensions(self.root).get(name)
+        return found if isinstance(found, dict) else {}
 
     def integer(self, owner: dict[str, Any], key: str, default: int | None, what: str) -> int:
         """Return the non-negative integer `owner[key]`; None for `default` makes it required."""
@@ -211,7 +216,7 @@ class GltfFile:
         if number is None:
             self.fail(f"{what} has no buffer view; export it again")
         view, name = self.items("bufferViews")[number], f"buffer view {number}"
-        if self.has_extension(view, *_COMPRESSED):
+        if self.has_extension(view, *_MESHOPT) and not self._has_plain_data(view):
             self.fail(f"{what} is compressed with meshopt, which is not supported; export it without compression")
         buffer = self._buffer(self.index(view, "buffer", "buffers", name))
         start, length = self.integer(view, "byteOffset", 0, name), self.integer(view, "byteLength", None, name)
@@ -222,6 +227,21 @@ class GltfFile:
         if stride < size or needed > length or start + length > len(buffer):
             self.fail(f"{what} ({count} elements) lies outside its buffer; copy, download or export the file again")
         return np.ndarray((count, width), dtype, buffer, start + offset if count else 0, (stride, dtype.itemsize))
+
+    def _has_plain_data(self, view: dict[str, Any]) -> bool:
+        """Return whether a buffer view that is compressed with meshopt also has its values without compression.
+
+        For readers like this one, its buffer may hold them; a buffer that only states a length is marked as fallback and has no
+        address. The compressed values are elsewhere.
+        """
+        number = self.index(view, "buffer", "buffers", "a buffer view")
+        compressed = next((value for name in _MESHOPT if isinstance(value := _extensions(view).get(name), dict)), {})
+        place = compressed.get("buffer"), compressed.get("byteOffset", 0)
+        if number is None or type(place[0]) is not int or place == (number, view.get("byteOffset", 0)):
+            return False
+        buffer = self.items("buffers")[number]
+        marks = [mark for name in _MESHOPT if isinstance(mark := _extensions(buffer).get(name), dict)]
+        return "uri" in buffer or (number == 0 and bool(self._binary) and not any(mark.get("fallback") for mark in marks))
 
     def _buffer(self, number: int | None) -> bytes:
         if number is None:
@@ -281,6 +301,11 @@ def _read_limited(path: Path, owner: Path, limit: int) -> bytes:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{what} cannot be opened ({getattr(error, 'strerror', None) or 'its name is not valid'})") from None
+
+
+def _extensions(owner: dict[str, Any]) -> dict[str, Any]:
+    found = owner.get("extensions")
+    return found if isinstance(found, dict) else {}
 
 
 def _shown(value: Any) -> str:

@@ -5,6 +5,7 @@ Source: Khronos, glTF 2.0 specification, section 3.7 (geometry, skins).
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,8 +19,9 @@ __all__ = ["MeshReader", "Piece", "dense_weights", "join_pieces", "moved", "weld
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _DRACO = "KHR_draco_mesh_compression"
 _MAX_PRIMITIVES = 10_000
-# 512 MiB and 3 s, with eight joints per vertex.
+# 512 MiB and 3 s, with eight joints per vertex; with more joints, fewer vertices.
 _MAX_VERTICES = 500_000
+_MAX_INFLUENCES = 8 * _MAX_VERTICES  # vertices times the joints that one of them follows
 _MAX_FACES = 1_000_000
 _MAX_WEIGHTS = 40_000_000  # 320 MB
 
@@ -44,7 +46,7 @@ class MeshReader:
     def __init__(self, file: GltfFile) -> None:
         self._file = file
         self._pieces: dict[tuple[int, int | None], Piece] = {}
-        self._vertices = self._faces = self._primitives = 0
+        self._vertices = self._faces = self._primitives = self._most_joints = 0
 
     def read(self, number: int, skin_joints: int | None) -> Piece:
         """Read all triangles of a mesh, as stored. Points, lines, and vertices that no triangle uses are left out.
@@ -77,6 +79,8 @@ class MeshReader:
     def _count(self, piece: Piece) -> None:
         self._vertices += len(piece.vertices)
         self._faces += len(piece.faces)
+        self._most_joints = max(self._most_joints, piece.joints.shape[1])
+        _check_influences(self._file, self._vertices, self._most_joints)
         if self._vertices > _MAX_VERTICES or self._faces > _MAX_FACES:
             self._file.fail(
                 f"wanted meshes of at most {_MAX_VERTICES} vertices and {_MAX_FACES} triangles, got more; simplify them"
@@ -88,10 +92,8 @@ def _read_primitive(file: GltfFile, primitive: dict[str, Any], skin_joints: int 
     attributes = primitive.get("attributes")
     if mode not in (_TRIANGLES, _STRIP, _FAN) or not isinstance(attributes, dict) or "POSITION" not in attributes:
         return None
-    if file.has_extension(primitive, _DRACO):
-        number = file.checked_index(attributes["POSITION"], "accessors", f"POSITION of {what}")
-        if "bufferView" not in file.items("accessors")[number]:
-            file.fail(f"{what} is compressed with Draco, which is not supported; export it without compression")
+    if file.has_extension(primitive, _DRACO) and not _has_plain_values(file, primitive, attributes, what):
+        file.fail(f"{what} is compressed with Draco, which is not supported; export it without compression")
     vertices = _attribute(file, attributes, "POSITION", ("VEC3",), None, what).astype(np.float64)
     indices = file.index(primitive, "indices", "accessors", what)
     if indices is None:
@@ -108,6 +110,14 @@ def _read_primitive(file: GltfFile, primitive: dict[str, Any], skin_joints: int 
     if skin_joints is not None:
         joints, weights = _read_weights(file, attributes, skin_joints, len(vertices), what)
     return Piece(vertices[used], inverse.reshape(-1, 3).astype(np.int64), joints[used], weights[used])
+
+
+def _has_plain_values(file: GltfFile, primitive: dict[str, Any], attributes: dict[str, Any], what: str) -> bool:
+    """Return whether all values that are read of a compressed primitive are also there without compression."""
+    read = [attributes[name] for name in attributes if name.startswith(("POSITION", "JOINTS_", "WEIGHTS_"))]
+    read += [primitive["indices"]] if "indices" in primitive else []
+    numbers = [file.checked_index(number, "accessors", f"an attribute of {what}") for number in read]
+    return all("bufferView" in file.items("accessors")[number] for number in numbers)
 
 
 def _attribute(
@@ -138,7 +148,8 @@ def _triangles(corners: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
 def _read_weights(
     file: GltfFile, attributes: dict[str, Any], skin_joints: int, count: int, what: str
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    sets = 2 if "JOINTS_1" in attributes and "WEIGHTS_1" in attributes else 1
+    sets = next(n for n in itertools.count(1) if f"JOINTS_{n}" not in attributes or f"WEIGHTS_{n}" not in attributes)
+    _check_influences(file, count, 4 * sets)
     parts = [_attribute(file, attributes, f"JOINTS_{n}", ("VEC4",), count, what) for n in range(sets)]
     joints = np.concatenate(parts, 1)
     parts = [_attribute(file, attributes, f"WEIGHTS_{n}", ("VEC4",), count, what) for n in range(sets)]
@@ -148,10 +159,17 @@ def _read_weights(
         file.fail(f"{what} refers to a joint beyond the {skin_joints} of its skin; export it again")
     # Sorted, so that vertices split along a seam have bitwise equal rows and sums.
     order = np.argsort(np.where(weights > 0, joints, skin_joints), axis=1, kind="stable")
+    width = max(1, int((weights > 0).sum(1).max(initial=0)))
+    order = order[:, :width]
     joints, weights = np.take_along_axis(joints, order, 1), np.take_along_axis(weights, order, 1)
     total = weights.sum(1, keepdims=True)
     weights[:, :1] = np.where(total > 0, weights[:, :1], 1.0)  # vertices without weights follow the first joint, as in viewers
     return joints, weights / np.where(total > 0, total, 1.0)
+
+
+def _check_influences(file: GltfFile, vertices: int, joints: int) -> None:
+    if vertices * joints > _MAX_INFLUENCES:
+        file.fail(f"{vertices} vertices follow up to {joints} joints each, which is too many; export it with fewer influences")
 
 
 def join_pieces(pieces: list[Piece]) -> Piece:

@@ -11,9 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.errors import UserError
 from snarfcli.formats.gltf_file import GltfFile
 
-__all__ = ["GltfAnimation", "read_animations"]
+__all__ = ["GltfAnimation", "LeftOut", "read_animations"]
+
+LeftOut = list[tuple[str, str]]
+"""Name of each animation that cannot be used, and the reason."""
 
 _WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 _MAX_CHANNELS = 30_000
@@ -75,8 +79,8 @@ class _Track:
         return int(self.duration * frame_rate + _EPSILON * frame_rate + 1e-6) + 1
 
 
-def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[GltfAnimation]:
-    """Sample every animation that moves a node; animations of morph targets are left out.
+def read_animations(file: GltfFile, frame_rate: float | None = None) -> tuple[list[GltfAnimation], LeftOut]:
+    """Sample every animation that moves a node; those of morph targets are left out, and so are damaged ones, with the reason.
 
     Args:
         file: the file.
@@ -84,9 +88,9 @@ def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[Glt
             known one is higher and gives too many frames.
 
     Raises:
-        UserError: times do not increase, values are damaged, or there are too many frames.
+        UserError: there are too many frames.
     """
-    tracks = _read_tracks(file)
+    tracks, left_out = _read_tracks(file)
     rates = [frame_rate or track.own_rate or _DEFAULT_RATE for track in tracks]
     if frame_rate is None and not _affordable(tracks, rates, len(file.items("nodes"))):
         rates = [min(rate, _DEFAULT_RATE) for rate in rates]
@@ -99,40 +103,59 @@ def read_animations(file: GltfFile, frame_rate: float | None = None) -> list[Glt
         samples += frames * len(track.targets)
         if samples > _MAX_SAMPLES:
             file.fail(f"its animations have over {_MAX_SAMPLES} samples at {rate:g} frames per second; export fewer")
-        at = start + np.minimum(np.arange(frames) / rate, duration)
-        nodes: dict[int, dict[str, NDArray[np.float64]]] = {}
-        for (node, path, sampler), keys in zip(track.targets, track.times, strict=True):
-            values, mode = _read_values(file, sampler, path, len(keys), track.what)
-            sampled = _sample(keys, values, mode, at, path == "rotation")
-            if path == "rotation":
-                length = np.linalg.norm(sampled, axis=1, keepdims=True)
-                if not (length > 1e-12).all():
-                    file.fail(f"{track.what}: a rotation of node {node} is a zero quaternion; export it again")
-                sampled = sampled / length
-            nodes.setdefault(node, {})[path] = sampled
+        try:
+            nodes = _sample_nodes(file, track, start + np.minimum(np.arange(frames) / rate, duration))
+        except UserError as error:
+            left_out.append((track.name or track.what, file.reason(error)))
+            continue
         found.append(GltfAnimation(track.name, float(rate), frames, nodes))
-    return found
+    return found, left_out
 
 
-def _read_tracks(file: GltfFile) -> list[_Track]:
+def _sample_nodes(file: GltfFile, track: _Track, at: NDArray[np.float64]) -> dict[int, dict[str, NDArray[np.float64]]]:
+    """Return `GltfAnimation.nodes` at the times `at` [T], seconds."""
+    nodes: dict[int, dict[str, NDArray[np.float64]]] = {}
+    for (node, path, sampler), keys in zip(track.targets, track.times, strict=True):
+        values, mode = _read_values(file, sampler, path, len(keys), track.what)
+        sampled = _sample(keys, values, mode, at, path == "rotation")
+        if path == "rotation":
+            length = np.linalg.norm(sampled, axis=1, keepdims=True)
+            if not (length > 1e-12).all():
+                file.fail(f"{track.what}: a rotation of node {node} is a zero quaternion; export it again")
+            sampled = sampled / length
+        nodes.setdefault(node, {})[path] = sampled
+    return nodes
+
+
+def _read_tracks(file: GltfFile) -> tuple[list[_Track], LeftOut]:
     """Read the channels and key times of every animation that moves a node."""
     animations = file.items("animations")
-    channels = [file.objects(a, "channels", f"animation {n}") for n, a in enumerate(animations)]
+    channels = [channels for animation in animations if isinstance(channels := animation.get("channels"), list)]
     if sum(map(len, channels)) > _MAX_CHANNELS:
         file.fail(f"its animations have over {_MAX_CHANNELS} channels; export fewer of them")
-    tracks = []
+    tracks: list[_Track] = []
+    left_out: LeftOut = []
     for number, animation in enumerate(animations):
         name = animation.get("name")
         name = name if isinstance(name, str) else ""
         what = f"animation {number} ({name!a:.40})" if name else f"animation {number}"
-        samplers = file.objects(animation, "samplers", what)
-        targets = [target for channel in channels[number] if (target := _target(file, channel, samplers, what))]
-        if targets:
-            times = [_read_times(file, sampler, what) for _, _, sampler in targets]
-            extras = animation.get("extras")
-            declared = extras.get("frame_rate") if isinstance(extras, dict) else None
-            tracks.append(_Track(name, what, targets, times, _own_rate(times, declared)))
-    return tracks
+        try:
+            track = _read_track(file, animation, name, what)
+        except UserError as error:
+            left_out.append((name or what, file.reason(error)))
+            continue
+        tracks += [track] if track.targets else []
+    return tracks, left_out
+
+
+def _read_track(file: GltfFile, animation: dict[str, Any], name: str, what: str) -> _Track:
+    samplers = file.objects(animation, "samplers", what)
+    channels = file.objects(animation, "channels", what)
+    targets = [target for channel in channels if (target := _target(file, channel, samplers, what))]
+    times = [_read_times(file, sampler, what) for _, _, sampler in targets]
+    extras = animation.get("extras")
+    declared = extras.get("frame_rate") if isinstance(extras, dict) else None
+    return _Track(name, what, targets, times, _own_rate(times, declared) if times else None)
 
 
 def _own_rate(times: list[NDArray[np.float64]], declared: Any) -> float | None:

@@ -17,6 +17,8 @@ from snarfcli.formats.gltf_file import GltfFile
 __all__ = ["NodeTree", "ShownMesh", "compose"]
 
 _MAX_NODES = 10_000
+_ZERO = 1e-12
+_HIDDEN_SCALE = 1e-4  # small enough to hide a part of a body, large enough to be inverted
 
 
 class ShownMesh(NamedTuple):
@@ -117,7 +119,10 @@ class NodeTree:
         return found
 
     def in_scene(self) -> list[int]:
-        """Return the nodes of the default scene, or all nodes if the file has no scene."""
+        """Return the nodes of the default scene, or all nodes if the file has no scene.
+
+        A scene should name nodes without a parent; some name others, which viewers show. They keep their place in the world.
+        """
         file = self._file
         number = file.index(file.root, "scene", "scenes", "the file")
         scenes = file.items("scenes")
@@ -127,7 +132,11 @@ class NodeTree:
         if not isinstance(roots, list):
             file.fail(f"nodes of scene {number or 0} is not a list; export it again")
         roots = [file.checked_index(root, "nodes", f"a node of scene {number or 0}") for root in roots]
-        return self._below(dict.fromkeys(root for root in roots if self.parents[root] < 0))
+        named, below = set(roots), set()
+        for number in self.order:
+            if self.parents[number] in named or self.parents[number] in below:
+                below.add(number)
+        return self._below(dict.fromkeys(root for root in roots if root not in below))
 
     def shown_meshes(self) -> list[ShownMesh]:
         """Return the meshes of the default scene, in the order of `in_scene`.
@@ -153,20 +162,29 @@ class NodeTree:
         return [number for number in self.order if number in wanted]
 
     def worlds(
-        self, numbers: Iterable[int], animated: Mapping[int, Mapping[str, NDArray[np.float64]]] | None = None
+        self,
+        numbers: Iterable[int],
+        animated: Mapping[int, Mapping[str, NDArray[np.float64]]] | None = None,
+        *,
+        keep_zero: bool = True,
     ) -> dict[int, NDArray[np.float64]]:
         """Return the transforms [T, 4, 4] from the frame of each node to the world; T is 1 for nodes that do not move.
 
         Args:
             numbers: node indices, as `with_ancestors` returns them.
             animated: per moving node, some of `translation` [T, 3], `rotation` [T, 4] and `scale` [T, 3] over time.
+            keep_zero: False for a scale of 1e-4 instead of 0, by which artists hide parts; directions are then still known.
         """
         found: dict[int, NDArray[np.float64]] = {}
         for number in numbers:
             local = self.locals[number]
-            if animated and number in animated:
-                rest = dict(zip(("translation", "rotation", "scale"), self._parts[number], strict=True))
-                local = compose(**{name: animated[number].get(name, value) for name, value in rest.items()})
+            moving = animated.get(number, {}) if animated else {}
+            scale = moving.get("scale", self._parts[number][2])
+            is_zero = np.abs(scale) < _ZERO
+            if moving or (not keep_zero and is_zero.any()):
+                scale = scale if keep_zero else np.where(is_zero, _HIDDEN_SCALE, scale)
+                translation, rotation, _ = self._parts[number]
+                local = compose(moving.get("translation", translation), moving.get("rotation", rotation), scale)
             parent = self.parents[number]
             found[number] = local.reshape(-1, 4, 4) if parent < 0 else found[parent] @ local
         return found

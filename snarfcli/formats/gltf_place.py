@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,14 @@ _ROUNDING = 1e-5
 
 
 def placed_skins(
-    skins: Mapping[int, Skin], here: Mapping[int, NDArray[np.float64]]
+    skins: Mapping[int, Skin], here: Mapping[int, NDArray[np.float64]], hidden: Set[int] = frozenset()
 ) -> tuple[dict[int, NDArray[np.float64]], dict[int, NDArray[np.float64]]]:
     """Bring skins that share joints into one frame, which is the world if that is known.
 
     Args:
         skins: skins by index, the most important first.
         here: [4, 4] per node, transform from the node to the world by default.
+        hidden: joints whose place by default says nothing, since their scale is 0.
 
     Returns:
         world_from_bind: [4, 4] per skin that agrees with the skins before it.
@@ -42,7 +43,8 @@ def placed_skins(
                 continue
             world = wanted[0]
         else:
-            wanted = np.stack([here[joint] for joint in skin.joints]) @ skin.inverse_bind
+            seen = [i for i, joint in enumerate(skin.joints) if joint not in hidden] or list(range(len(skin.joints)))
+            wanted = np.stack([here[skin.joints[i]] for i in seen]) @ skin.inverse_bind[seen]
             world = wanted[0] if _agree(wanted, points) else _upright(wanted)
         if _agree(np.stack([world, np.eye(4)]), points, _ROUNDING):
             world = np.eye(4)  # leaves the stored vertices bitwise unchanged

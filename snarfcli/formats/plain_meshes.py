@@ -1,10 +1,10 @@
-"""Parse the triangles of OBJ, OFF and STL files from their bytes; polygons are cut into fans.
+"""Parse the triangles of OBJ and STL files from their bytes; polygons are cut into fans.
 
 All parsers raise ValueError with a short reason. They use memory in proportion to the bytes given, not to declared counts.
 
-trimesh 5.2, a dependency already, does not replace them or `ply.py`. Measured on a grid of 500,000 triangles (seconds, ours and
-trimesh): OBJ 2.9 and 1.9, OFF 1.2 and 3.4, PLY 0.01 and 0.17, PLY as text 2.3 and 3.0, STL 0.06 and 0.88. It also reads some
-valid files differently, even with `process=False, maintain_order=True`:
+trimesh 5.2, a dependency already, does not replace them, `off.py` or `ply.py`. Measured on a grid of 500,000 triangles
+(seconds, ours and trimesh): OBJ 2.9 and 1.9, OFF 1.6 and 3.4, PLY 0.01 and 0.17, PLY as text 2.3 and 3.0, STL 0.06 and 0.88. It
+also reads some valid files differently, even with `process=False, maintain_order=True`:
 
 - OBJ: relative numbers count from the end of the file, not from the line of the face, so they name other vertices; a comment
   after a face or line ends of a lone CR raise; `usemtl` splits a mesh and duplicates its vertices.
@@ -17,13 +17,14 @@ valid files differently, even with `process=False, maintain_order=True`:
 from __future__ import annotations
 
 import io
+import re
 from array import array
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_FACES", "Surface", "add_fan", "parse_obj", "parse_off", "parse_stl"]
+__all__ = ["MAX_FACES", "Surface", "add_fan", "parse_obj", "parse_stl", "surface_of", "text_lines"]
 
 Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices [V, 3] and faces [F, 3]; the indices in faces are not yet checked."""
@@ -31,6 +32,8 @@ Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
 MAX_FACES = 1_000_000  # an STL file of this size is read and merged in about 3 s
 _MAX_LINES = 2_000_000  # about 5 s
 _MAX_LINE = 2**20  # bytes; splitting a line into words takes up to thirty times its size
+_CONTINUED = re.compile(rb"\\[ \t]*(?:\r\n|\r|\n)")  # a backslash at the end of a line
+_STL_LINES = {b"facet": 5, b"outer": 2, b"vertex": 4, b"endloop": 1, b"endfacet": 1}  # words in a line
 _STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
@@ -50,7 +53,7 @@ def add_fan(corners: array, polygon: Sequence[int]) -> None:
 def parse_obj(content: bytes) -> Surface:
     """Parse the `v` and `f` lines of an OBJ file; other lines (texture coordinates, materials, curves) are skipped."""
     positions, corners = array("d"), array("q")
-    for words in _lines(content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")):
+    for words in text_lines(_CONTINUED.sub(b" ", content) if b"\\" in content else content):
         if words[0] == b"v":
             if len(words) < 4:
                 raise ValueError(f"a vertex: wanted 3 coordinates, got {len(words) - 1}")
@@ -60,34 +63,7 @@ def parse_obj(content: bytes) -> Surface:
             polygon = [int(word.partition(b"/")[0]) for word in words[1:]]
             # 1 is the first vertex of the file, -1 the last vertex before this line; 0 is invalid.
             add_fan(corners, [i - 1 if i > 0 else count + i if i < 0 else -1 for i in polygon])
-    return _surface(positions, corners)
-
-
-def parse_off(content: bytes) -> Surface:
-    """Parse an OFF file in text form; colours and normals are skipped."""
-    lines = _lines(content)
-    words = next(lines, [b""])
-    if not words[0].upper().endswith(b"OFF"):
-        raise ValueError("it does not begin with OFF")
-    words = words[1:] or next(lines, [])
-    if len(words) < 2:
-        raise ValueError("the numbers of vertices and faces are missing")
-    num_vertices, num_faces = int(words[0]), int(words[1])
-    positions, corners = array("d"), array("q")
-    for _ in range(num_vertices):
-        words = next(lines, [])
-        if len(words) < 3:
-            raise ValueError(f"wanted {num_vertices} vertices, got {len(positions) // 3}")
-        positions.extend(map(float, words[:3]))
-    for number in range(num_faces):
-        words = next(lines, [])
-        if not words:
-            raise ValueError(f"wanted {num_faces} faces, got {number}")
-        count = int(words[0])
-        if not 0 <= count < len(words):
-            raise ValueError(f"a face: wanted {count} corners, got {len(words) - 1}")
-        add_fan(corners, [int(word) for word in words[1 : 1 + count]])
-    return _surface(positions, corners)
+    return surface_of(positions, corners)
 
 
 def parse_stl(content: bytes) -> Surface:
@@ -99,23 +75,46 @@ def parse_stl(content: bytes) -> Surface:
     if len(content) >= 84 and (end == len(content) or (end <= len(content) and not is_text)):
         vertices = np.frombuffer(content, _STL_FACE, count, 84)["corners"].astype(np.float64).reshape(-1, 3)
     elif is_text:
-        positions = array("d")
-        for words in _lines(content):
-            if words[0].lower() == b"vertex":
-                if len(words) != 4:
-                    raise ValueError(f"a vertex: wanted 3 coordinates, got {len(words) - 1}")
-                positions.extend(map(float, words[1:]))
-        vertices = np.array(positions).reshape(-1, 3)
-        if len(vertices) % 3:
+        positions = _stl_text(content)
+        if len(positions) % 9:
             raise ValueError("its last triangle is incomplete")
+        vertices = np.array(positions).reshape(-1, 3)
     else:
         raise ValueError(f"wanted {end} bytes, got {len(content)}")
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
 
 
-def _lines(content: bytes) -> Iterator[list[bytes]]:
-    """Yield the words of each non-empty line, without comments."""
-    content = content if b"\n" in content else content.replace(b"\r", b"\n")
+def _stl_text(content: bytes) -> array:
+    """Return the coordinates behind each word `vertex`, however the words are spread over lines."""
+    positions, missing = array("d"), 0
+    for words in text_lines(content):
+        if not missing and len(words) == _STL_LINES.get(words[0].lower()):  # as nearly all writers do
+            if len(words) == 4:
+                positions.extend(map(float, words[1:]))
+            continue
+        is_name = False  # any words behind `solid` and `endsolid`
+        for word in (word.lower() for word in words):
+            if missing:
+                positions.append(float(word))
+                missing -= 1
+            elif word in (b"solid", b"endsolid", b"facet"):
+                is_name = word != b"facet"
+            elif word == b"vertex" and not is_name:
+                missing = 3
+    if missing:
+        raise ValueError(f"a vertex: wanted 3 coordinates, got {3 - missing}")
+    return positions
+
+
+def text_lines(content: bytes) -> Iterator[list[bytes]]:
+    """Yield the words of each non-empty line, without comments; lines may end in LF, CR LF or CR, also in one file.
+
+    Raises:
+        ValueError: there are too many lines, or a line is too long.
+    """
+    content = content.removeprefix(b"\xef\xbb\xbf")  # a mark that some editors write before text
+    if b"\r" in content:
+        content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if content.count(b"\n") > _MAX_LINES:
         raise ValueError(f"wanted at most {_MAX_LINES} lines, got more; save it in a binary format")
     for line in io.BytesIO(content):
@@ -126,5 +125,6 @@ def _lines(content: bytes) -> Iterator[list[bytes]]:
             yield words
 
 
-def _surface(positions: array, corners: array) -> Surface:
+def surface_of(positions: array, corners: array) -> Surface:
+    """Return the vertices and faces that are stored one after another in two arrays."""
     return np.array(positions, np.float64).reshape(-1, 3), np.array(corners, np.int64).reshape(-1, 3)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,3 +52,7 @@ class Rig:
     """The motions; may be empty."""
     mesh: RigMesh | None = None
     """The mesh, if the file has one."""
+    humanoid: Mapping[str, int] = field(default_factory=dict)
+    """Joint of each bone of a human body that the file names as VRM 1.0 does, such as `leftUpperLeg`; empty for most files."""
+    left_out: tuple[tuple[str, str], ...] = ()
+    """Name of each motion of the file that cannot be used, and the reason."""

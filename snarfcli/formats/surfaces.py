@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from snarfcli.errors import UserError, one_line
 from snarfcli.formats.gltf import read_gltf_surface
-from snarfcli.formats.plain_meshes import MAX_FACES, parse_obj, parse_off, parse_stl
+from snarfcli.formats.off import parse_off
+from snarfcli.formats.plain_meshes import MAX_FACES, parse_obj, parse_stl
 from snarfcli.formats.ply import parse_ply
 
 __all__ = ["SURFACE_SUFFIXES", "list_surfaces", "read_surface"]
@@ -19,6 +20,7 @@ SURFACE_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """File suffixes that `read_surface` accepts, in lower case."""
 
 _PARSERS = {".obj": parse_obj, ".off": parse_off, ".ply": parse_ply, ".stl": parse_stl}
+_TEXT_PLY = re.compile(rb"\A(?:\xef\xbb\xbf)?ply\s(?:.*[\r\n])?\s*format\s+ascii", re.DOTALL)
 _MAX_BYTES = 64 * 2**20
 # A word of text takes up to 60 bytes after splitting. PLY files are split as a whole, the others line by line.
 _MAX_WORDS = 8_000_000
@@ -111,7 +113,7 @@ def _read_bytes(path: Path) -> bytes:
         content = path.read_bytes()
     except OSError as error:
         raise UserError(f"mesh {path} cannot be opened ({error.strerror or error})") from None
-    if content.startswith(b"ply") and b"format ascii" in content[:1000]:
+    if _TEXT_PLY.search(content, 0, 2**16):
         values = np.frombuffer(content, np.uint8)
         if sum(np.count_nonzero(np.diff(piece <= 32)) for piece in np.array_split(values, 32)) > 2 * _MAX_WORDS:
             raise UserError(f"mesh {path} has over {_MAX_WORDS} words of text; simplify it, or save it as binary")

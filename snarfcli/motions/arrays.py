@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError
+from snarfcli.motions.angles import angle_problem
 from snarfcli.motions.layouts import BODY_JOINTS, FINGER_JOINTS, LAYOUTS, carry_over, layout_of
 from snarfcli.motions.motion import Motion
 from snarfcli.motions.up_axis import Up, up_axis, y_up_from_z_up
@@ -38,10 +39,6 @@ _PARTS = {
 }
 POSE_KEYS = (*_POSES, *_TRANSLATIONS, "smpl_scaling", *_FRAME_RATES, *_PARTS, "up", "gender")
 """Names of all arrays that are read; gender is not used, but pickled objects in its place are rejected."""
-# Angles of joints are below pi, or below 2 pi if unwrapped. In degrees, some joint of a body exceeds these 12.6 in nearly every
-# frame. The root is left out, since it may rotate several times.
-_DEGREES = 4 * np.pi
-_MAX_ANGLE = 1e4
 _MAX_DISTANCE_M = 1e6
 
 
@@ -179,11 +176,9 @@ def _wanted(skeleton: Skeleton) -> str:
 
 
 def _check_angles(poses: NDArray[np.float64], path: Path) -> None:
-    largest = np.abs(poses).max()
-    if poses.shape[1] > 1 and np.median(np.abs(poses[:, 1:]).max((1, 2))) > _DEGREES:
-        raise UserError(f"pose file {path}: wanted angles in radians, got degrees, up to {largest:.5g}; save them in radians")
-    if largest > _MAX_ANGLE:
-        raise UserError(f"pose file {path}: wanted angles in radians, got {largest:.5g}; repair the file")
+    problem = angle_problem(poses)
+    if problem:
+        raise UserError(f"pose file {path}: {problem}")
 
 
 def _numbers(array: NDArray, name: str, path: Path) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
 from snarfcli.formats.rig import Rig
+from snarfcli.motions.humanoid import humanoid_parts
 from snarfcli.motions.joint_names import REQUIRED_PARTS, BodyParts, find_body_parts, spine_between
 from snarfcli.motions.plain_names import plain_name
 from snarfcli.motions.tree_shape import find_by_shape
@@ -29,8 +30,8 @@ def map_joints(
     """Return the index of the rig's joint that moves each joint of the skeleton; joints without one are left out.
 
     If the rig has every name of the skeleton, joints are paired by name. Otherwise they are paired as parts of a human body,
-    the joints of the spine from both ends, and the remaining joints by name. Parts that names do not tell are taken from the
-    shape of the tree if that is clearly a person. `mapping` overrides all this.
+    which a VRM file names itself, the joints of the spine from both ends, and the remaining joints by name. Parts that names do
+    not tell are taken from the shape of the tree if that is clearly a person. `mapping` overrides all this.
 
     Args:
         skeleton: the target.
@@ -47,7 +48,8 @@ def map_joints(
     if all(name in exact for name in skeleton.names):
         pairs = {joint: exact[name] for joint, name in enumerate(skeleton.names)}
     else:
-        target, source = find_body_parts(skeleton.names, skeleton.parents), find_body_parts(rig.names, rig.parents)
+        target = find_body_parts(skeleton.names, skeleton.parents)
+        source = humanoid_parts(rig) or find_body_parts(rig.names, rig.parents)
         if mapping is None and source.missing and not target.missing:
             source = _with_shape(source, rig, path)
         pairs = _pair_parts(target, source)

@@ -14,7 +14,7 @@ from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, legs_apart_pose
 from snarfcli.errors import UserError
 from snarfcli.files import read_npy, read_npz
 from snarfcli.formats.bvh import read_bvh
-from snarfcli.formats.gltf import read_gltf
+from snarfcli.formats.gltf import GLTF_SUFFIXES, read_gltf
 from snarfcli.formats.pickles import read_pickle
 from snarfcli.formats.rig import Rig
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS
@@ -28,7 +28,7 @@ from snarfcli.motions.up_axis import UPS, Up
 __all__ = ["MOTION_SUFFIXES", "read_motion"]
 
 _ARRAY_SUFFIXES = (".npz", ".npy", ".pkl", ".pickle")
-_RIG_SUFFIXES = (".bvh", ".glb", ".gltf")
+_RIG_SUFFIXES = (".bvh", *GLTF_SUFFIXES)
 MOTION_SUFFIXES = (*_ARRAY_SUFFIXES, *_RIG_SUFFIXES)
 """Suffixes of supported files, in lower case."""
 _MAX_FILES = 100_000  # in a folder with one pose per file: half an hour at 60 frames per second
@@ -52,7 +52,7 @@ def read_motion(
     | `.npy` | poses, one array |
     | `.pkl` | AIST++; nothing in it is executed |
     | folder | one `.npz` per frame with `pose` and optionally `trans` or `transl`, as in CAPE and the papers' demo; 1, 2, 10 |
-    | `.bvh`, `.glb`, `.gltf` | joints of any program, recognised by name |
+    | `.bvh`, `.glb`, `.gltf`, `.vrm`, `.vrma` | joints of any program, recognised by name, or by the table of bones of VRM |
 
     Args:
         path: file or folder.

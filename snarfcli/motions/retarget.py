@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError, nearest
+from snarfcli.formats.gltf import GLTF_SUFFIXES
 from snarfcli.formats.rig import Rig, RigClip
 from snarfcli.motions.clip_turns import all_limbs, clip_turns, doubtful_limbs, false_toes
 from snarfcli.motions.joint_names import find_body_parts
@@ -136,7 +137,7 @@ def retarget_rig(
     parts = find_body_parts(skeleton.names, skeleton.parents)
     joints_rest = skeleton.joints_rest.detach().cpu().double().numpy()
     own = straightened(rig, skeleton, pairs)
-    if up == "auto" and own is not rig and path.suffix.lower() in (".glb", ".gltf"):
+    if up == "auto" and own is not rig and path.suffix.lower() in GLTF_SUFFIXES:
         up = "y"  # the file was exported for this skeleton, so it follows the format; a lying body would mislead the guess
     rig = resting_in(rig, clip, int(rest), path) if rest.isdecimal() else own
     match = RestMatch(pairs, parts.joints, parts.spine, joints_rest, rig.rest[:, :3, 3], skeleton.parents, rig.parents)

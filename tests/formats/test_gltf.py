@@ -10,56 +10,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from toy_animal import FRAME_RATE, animal_motion, make_animal
 from toy_animal_files import animal_glb
-from toy_gltf import GltfBuilder
+from toy_gltf import BOX, GltfBuilder, two_bones
 
 from snarfcli.errors import UserError
 from snarfcli.formats.gltf import read_gltf, read_gltf_surface
-
-_BOX = trimesh.creation.box((0.2, 1.0, 0.2))
-_HALF = np.sqrt(0.5)
-
-
-def _two_bones(indices=True, **more):
-    """A box that stands on the floor below an armature of scale 0.01 with z up, and bends in the middle.
-
-    Nodes: 0 armature, 1 upper bone, 2 something between, 3 lower bone, 4 mesh (moved, which counts for nothing).
-    """
-    builder = GltfBuilder()
-    positions = np.float32(_BOX.vertices @ Rotation.from_euler("x", 90, degrees=True).as_matrix().T * 100)  # cm, z up
-    positions = positions + np.float32([0, 0, 50])
-    above = positions[:, 2:] > 50
-    corners = _BOX.faces.ravel()
-    attributes = {
-        "POSITION": builder.array(positions if indices else positions[corners]),
-        "JOINTS_0": builder.array((np.where(above, 0, 1) * [[1, 0, 0, 0]])[slice(None) if indices else corners], "uint8"),
-        "WEIGHTS_0": builder.array(([[255, 0, 0, 0]] * 8 if indices else [[255, 0, 0, 0]] * 36), "uint8", normalized=True),
-    }
-    inverse = np.tile(np.eye(4), (2, 1, 1))
-    inverse[:, 2, 3] = -50, 0
-    times = builder.array([1.0, 2.0])
-    spin = [[0, 0, 0, 1], [0, 0, _HALF, _HALF]]
-    builder.root.update(
-        nodes=[
-            {"name": "armature", "scale": [0.01] * 3, "rotation": [-_HALF, 0, 0, _HALF], "children": [1]},
-            {"name": "bone", "translation": [0, 0, 50], "children": [2]},
-            {"translation": [0, 0, -20], "children": [3]},
-            {"name": "bone", "translation": [0, 0, -30]},
-            {"mesh": 0, "skin": 0, "translation": [7, 7, 7]},
-        ],
-        scenes=[{"nodes": [0, 4]}],
-        skins=[{"joints": [3, 1], "inverseBindMatrices": builder.array(inverse[::-1])}],
-        meshes=[{"primitives": [{"attributes": attributes}]}],
-        animations=[
-            {
-                "samplers": [{"input": times, "output": builder.array(spin)}],
-                "channels": [{"sampler": 0, "target": {"node": 1, "path": "rotation"}}],
-            }
-        ],
-    )
-    if indices:
-        builder.root["meshes"][0]["primitives"][0]["indices"] = builder.array(corners, "uint16")
-    builder.root.update(more)
-    return builder
 
 
 def _read(tmp_path, builder, reader=read_gltf, **options):
@@ -76,7 +30,7 @@ def _posed(rig, clip, frame):
 
 
 def test_armature_scale_and_axes_are_undone(tmp_path):
-    rig = _read(tmp_path, _two_bones())
+    rig = _read(tmp_path, two_bones())
     assert rig.names == ("bone", "bone_2")
     assert rig.parents == (-1, 0)
     np.testing.assert_allclose(rig.rest[:, :3, 3], [[0, 0.5, 0], [0, 0, 0]], atol=1e-6)
@@ -92,7 +46,7 @@ def test_armature_scale_and_axes_are_undone(tmp_path):
 
 
 def test_bind_pose_that_no_node_stands_in_keeps_scale_and_axes(tmp_path):
-    builder = _two_bones()
+    builder = two_bones()
     builder.root["nodes"][3]["rotation"] = Rotation.from_euler("x", 40, degrees=True).as_quat().tolist()
     rig = _read(tmp_path, builder)
     np.testing.assert_allclose(np.sort(rig.mesh.vertices, 0)[[0, -1]], [[-0.1, 0, -0.1], [0.1, 1, 0.1]], atol=1e-6)
@@ -154,13 +108,13 @@ def test_animal_is_skinned_as_the_specification_says(tmp_path):
 
 
 def test_vertices_split_along_seams_are_welded(tmp_path):
-    rig = _read(tmp_path, _two_bones(indices=False))
+    rig = _read(tmp_path, two_bones(indices=False))
     assert rig.mesh.vertices.shape == (8, 3)
     assert trimesh.Trimesh(rig.mesh.vertices, rig.mesh.faces, process=False).is_watertight
 
 
 def test_touching_parts_with_other_weights_stay_apart(tmp_path):
-    builder = _two_bones(indices=False)
+    builder = two_bones(indices=False)
     attributes = builder.root["meshes"][0]["primitives"][0]["attributes"]
     attributes["JOINTS_0"] = builder.array([[k // 18, 0, 0, 0] for k in range(36)], "uint8")
     rig = _read(tmp_path, builder)
@@ -168,7 +122,7 @@ def test_touching_parts_with_other_weights_stay_apart(tmp_path):
 
 
 def test_two_skins_of_the_same_joints_are_joined(tmp_path):
-    builder = _two_bones()
+    builder = two_bones()
     root = builder.root
     # The second mesh is stored in metres, y up: its inverse bind matrices undo the armature.
     bind = np.eye(4)
@@ -177,11 +131,11 @@ def test_two_skins_of_the_same_joints_are_joined(tmp_path):
     first[1, 2, 3] = -50
     root["skins"].append({"joints": [3, 1], "inverseBindMatrices": builder.array(first @ bind)})
     attributes = {
-        "POSITION": builder.array(np.add(_BOX.vertices, [1, 0.5, 0])),
+        "POSITION": builder.array(np.add(BOX.vertices, [1, 0.5, 0])),
         "JOINTS_0": builder.array([[1, 0, 0, 0]] * 8, "uint16"),
         "WEIGHTS_0": builder.array([[1, 0, 0, 0]] * 8),
     }
-    indices = builder.array(_BOX.faces.ravel(), "uint32")
+    indices = builder.array(BOX.faces.ravel(), "uint32")
     root["meshes"].append({"primitives": [{"attributes": attributes, "indices": indices}]})
     root["nodes"].append({"mesh": 1, "skin": 1})
     root["scenes"][0]["nodes"].append(5)
@@ -196,8 +150,8 @@ def test_two_skins_of_the_same_joints_are_joined(tmp_path):
 def _robot(**more):
     """Two boxes: 0 carries 2 by way of 1, which has no mesh and turns."""
     builder = GltfBuilder()
-    attributes = {"POSITION": builder.array(_BOX.vertices)}
-    indices = builder.array(_BOX.faces.ravel(), "uint8")
+    attributes = {"POSITION": builder.array(BOX.vertices)}
+    indices = builder.array(BOX.faces.ravel(), "uint8")
     times = builder.array([0.0, 0.5, 1.0])
     builder.root.update(
         nodes=[
@@ -235,7 +189,7 @@ def test_robot_of_rigid_parts(tmp_path):
     np.testing.assert_allclose(clip.world_from_joint[:, 2, :3, 3], clip.world_from_joint[:, 1, :3, 3] + [0, 0.5, 0])
     vertices, faces = _read(tmp_path, _robot(), read_gltf_surface)
     assert len(vertices) == 12  # the boxes share four corners, which are welded although they follow different joints
-    assert trimesh.Trimesh(vertices, faces, process=False).area == pytest.approx(2 * _BOX.area)
+    assert trimesh.Trimesh(vertices, faces, process=False).area == pytest.approx(2 * BOX.area)
 
 
 def test_step_holds_and_cubic_spline_follows_its_tangents(tmp_path):
@@ -288,7 +242,7 @@ def test_strips_fans_sparse_and_interleaved_arrays(tmp_path):
 
 
 def test_second_set_of_joints_counts(tmp_path):
-    builder = _two_bones()
+    builder = two_bones()
     attributes = builder.root["meshes"][0]["primitives"][0]["attributes"]
     attributes["WEIGHTS_0"] = builder.array([[0.5, 0, 0, 0]] * 8)
     attributes["JOINTS_1"] = builder.array([[0, 1, 0, 0]] * 8, "uint16")
@@ -299,7 +253,7 @@ def test_second_set_of_joints_counts(tmp_path):
 
 def test_gltf_with_its_buffer_inside_or_beside(tmp_path):
     (tmp_path / "parts").mkdir()
-    builder = _two_bones()
+    builder = two_bones()
     expected = _read(tmp_path, builder)
     (tmp_path / "inside.gltf").write_bytes(builder.gltf())
     (tmp_path / "beside.gltf").write_bytes(builder.gltf("parts/the%20buffer.bin"))
@@ -323,7 +277,7 @@ def test_buffers_elsewhere_are_refused(uri, tmp_path):
     (folder / "folder").symlink_to(tmp_path)
     (tmp_path / "a.bin").write_bytes(b"\0" * 10_000)
     os.mkfifo(folder / "pipe")
-    (folder / "file.gltf").write_bytes(_two_bones().gltf(uri or " "))
+    (folder / "file.gltf").write_bytes(two_bones().gltf(uri or " "))
     with pytest.raises(UserError, match=r"same folder|missing|not a file|cannot be opened") as error:
         read_gltf(folder / "file.gltf")
     assert "file.gltf" in str(error.value)
@@ -331,7 +285,7 @@ def test_buffers_elsewhere_are_refused(uri, tmp_path):
 
 
 def _edited(edit):
-    builder = _two_bones()
+    builder = two_bones()
     edit(builder)
     return builder
 
@@ -414,8 +368,8 @@ def test_broken_files_are_refused(edit, message, tmp_path):
         (b"[]", "not an object"),
         (b'{"asset": {"version": "2.0"}}', "no skin, no mesh and no animation"),
         (b'{"asset": {"version": ' + b"9" * 5000 + b"}}", "no valid JSON"),
-        (_two_bones().glb()[:-10], "wanted .* bytes, got"),
-        (_two_bones().glb()[:4] + b"\1" + _two_bones().glb()[5:], "wanted 2, got 1"),
+        (two_bones().glb()[:-10], "wanted .* bytes, got"),
+        (two_bones().glb()[:4] + b"\1" + two_bones().glb()[5:], "wanted 2, got 1"),
     ],
 )
 def test_broken_containers_are_refused(content, message, tmp_path):
@@ -433,7 +387,7 @@ def test_missing_file_and_folder_are_refused(tmp_path):
 
 def _turning(times, extras=None, *, ends=None, count=1):
     """Two bones, the upper of which turns, with keys at these times; the other has keys at `ends`."""
-    builder = _two_bones()
+    builder = two_bones()
     times = np.asarray(times, np.float64)
     angle = np.linspace(0, 1, len(times)) ** 2
     spin = np.stack([0 * angle, 0 * angle, np.sin(angle), np.cos(angle)], 1)

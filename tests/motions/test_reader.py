@@ -138,6 +138,6 @@ def test_a_pickle_that_runs_code_is_refused(tmp_path):
 def test_clip_and_mapping_are_for_rigs(tmp_path):
     path = save(tmp_path, **amass_arrays())
     for setting in ({"clip": 0}, {"mapping": {}}):
-        message = f"{next(iter(setting))}: wanted a file ending in .bvh, .glb, .gltf, got pose file .*leave it out"
+        message = f"{next(iter(setting))}: wanted a file ending in .bvh, .glb, .gltf, .vrm, .vrma, got pose file .*leave it out"
         with pytest.raises(UserError, match=message):
             read_motion(path, **setting)

@@ -56,8 +56,8 @@ def named_joints(names: Sequence[str], parents: Sequence[int], style: str | None
         style: one of `NAMINGS`; None returns the names as they are.
 
     Returns:
-        J unique names. Joints without a counterpart keep their names, after a mark `extra_` where these would be mistaken for another
-        joint. Joints NAME_end, which were End Sites of a BVH file, follow their parents.
+        J unique names. Joints without a counterpart keep their names, with a mark `extra_` where these would be mistaken for
+        another joint. Joints NAME_end, which were End Sites of a BVH file, follow their parents.
 
     Raises:
         UserError: the skeleton is not human; the message names the parts that are missing.

@@ -35,8 +35,8 @@ def export_vrma(
 ) -> int:
     """Write a motion as `.vrma`, whole or not at all: rotations of the humanoid bones, the way of the hips, and expressions.
 
-    The T-pose is the rest pose of the nodes, whose axes are those of the avatar's joints: so `read_motion` gives back the poses.
-    Joints between two bones are part of the motion of the lower bone. Changes of length are left out, as the format requires.
+    The nodes rest in the T-pose, with the axes of the avatar's joints there, so that `read_motion` gives back the poses. Joints
+    between two bones are part of the motion of the lower bone. Changes of length are left out, as the format requires.
 
     Args:
         path: the file.

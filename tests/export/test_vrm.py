@@ -44,7 +44,7 @@ needs_vrm = pytest.mark.skipif(
 def punching() -> Motion:
     """Return a motion of the toy that stands on y = 0, as exported motions do."""
     motion = builtin_motion("punching", 0, frame_rate=RATE).slice(stop=8)
-    return replace(motion, translation=motion.translation + [0.2, 1.22, 0.1])
+    return replace(motion, translation=np.add(motion.translation, [0.2, 1.22, 0.1]))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Runs inside of Blender: prints the joints of a BVH file, and their positions in the world at some frames, y up as in the file.
+"""Runs inside of Blender: prints where the joints of a BVH file are at some frames, metres, y up as in the file.
 
 Arguments after "--": FILE RATE FRAME...
 """

@@ -11,6 +11,7 @@ from torch import Tensor
 from snarfcli.export.character import CharacterOptions
 from snarfcli.export.clips import Clip
 from snarfcli.export.export import ExportReport, export_character
+from snarfcli.export.joint_naming import named_joints
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.posed import posed_mesh
 from snarfcli.meshing.skinned import SkinnedSurface, skinned_surface
@@ -54,6 +55,7 @@ class Avatar(TrainedField):
         morph_targets: int = 8,
         resolution: int = 256,
         weight_colors: bool = False,
+        names: str | None = None,
         overwrite: bool = False,
     ) -> ExportReport:
         """Write a rigged, animated character as one `.glb` file, like `snarf export`. The file is whole or absent.
@@ -66,6 +68,7 @@ class Avatar(TrainedField):
             morph_targets: maximum number of morph targets for the pose-dependent shape; 0 for the mean shape.
             resolution: voxels along the longest side of the canonical box.
             weight_colors: whether vertices are coloured by their skinning weights.
+            names: names of the joints of a human: "smpl", "mixamo", "vrm" or "unreal"; the skeleton's own by default.
             overwrite: whether an existing file is replaced.
 
         Returns:
@@ -77,4 +80,5 @@ class Avatar(TrainedField):
         several = [motions] if isinstance(motions, Motion | Clip) else motions
         clips = [motion if isinstance(motion, Clip) else Clip(motion) for motion in several]
         options = CharacterOptions(triangles, influences, morph_targets, resolution, weight_colors)
-        return export_character(self, path, clips, options, overwrite=overwrite)
+        joint_names = named_joints(self.skeleton.names, self.skeleton.parents, names)
+        return export_character(self, path, clips, options, joint_names=joint_names, overwrite=overwrite)

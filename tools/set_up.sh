@@ -24,14 +24,14 @@ if ! "$venv/bin/python" -c 'import torch' 2>/dev/null; then
     fi
 fi
 $pip install --quiet --editable '.[test]'
-# Independent readers of glTF for the tests. The tests are skipped without them: npm or the network may be missing.
+# Independent readers of glTF, VRM and BVH for the tests. The tests are skipped without them: npm or the network may be missing.
 readers=build/readers
 if command -v npm >/dev/null 2>&1 && ! cmp -s tests/readers/package.json $readers/package.json; then
     mkdir -p $readers.new && cp tests/readers/package.json $readers.new/ &&
         npm install --prefix $readers.new --ignore-scripts --no-audit --no-fund --silent --fetch-retries=1 --fetch-timeout=30000 &&
         rm -rf $readers && mv $readers.new $readers || {
         rm -rf $readers.new
-        echo "three.js and the Khronos validator could not be installed into $readers; their tests are skipped" >&2
+        echo "three.js, three-vrm and the Khronos validator could not be installed into $readers; their tests are skipped" >&2
     }
 fi
 touch "$venv/.snarf-installed"

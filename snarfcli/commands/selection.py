@@ -29,6 +29,7 @@ __all__ = [
     "SelectedMotion",
     "check_motion_selection",
     "load_selected_avatar",
+    "select_frames",
     "select_motion",
 ]
 
@@ -142,7 +143,7 @@ def check_motion_selection(choice: MotionSelection) -> None:
 def select_motion(
     choice: MotionSelection, avatar: AvatarSelection, skeleton: Skeleton, pose: str | None, motion: str | None
 ) -> SelectedMotion:
-    """Read a motion and select frames: start, stop and step are applied first, then frame_rate, then max_frames.
+    """Read a motion and select frames, see `select_frames`.
 
     Args:
         choice: how to read it, and which frames.
@@ -155,7 +156,23 @@ def select_motion(
     Raises:
         UserError: the motion does not exist, does not fit the skeleton, or no frame is left.
     """
-    whole, transforms = _read(choice, avatar, skeleton, pose, motion)
+    return select_frames(choice, *_read(choice, avatar, skeleton, pose, motion))
+
+
+def select_frames(
+    choice: MotionSelection, whole: Motion, transforms: NDArray[np.float32] | None = None, *, up: str = "y"
+) -> SelectedMotion:
+    """Select frames of a motion: start, stop and step are applied first, then frame_rate, then max_frames.
+
+    Args:
+        choice: which frames.
+        whole: all frames.
+        transforms: [T, J, 4, 4], canonical to posed, if joints stretch; otherwise None.
+        up: up axis of the motion, y or z, for in_place.
+
+    Raises:
+        UserError: no frame is left, or the motion cannot be resampled.
+    """
     numbers = list(range(*slice(choice.start, choice.stop, choice.step).indices(whole.num_frames)))
     if not numbers:
         stop = "null" if choice.stop is None else choice.stop
@@ -178,11 +195,12 @@ def select_motion(
     taken, numbers = taken.slice(stop=choice.max_frames), numbers[: choice.max_frames]
     transforms = None if transforms is None else transforms[: len(numbers)]
     if choice.in_place:
-        way = taken.translation * (1.0, 0.0, 1.0)
+        way = taken.translation * ((1.0, 0.0, 1.0) if up == "y" else (1.0, 1.0, 0.0))
         taken = replace(taken, translation=taken.translation - way)
         if transforms is not None:
-            transforms = transforms.copy()
-            transforms[:, :, :3, 3] -= way[:, None].astype(np.float32)
+            moved = transforms.copy()
+            moved[:, :, :3, 3] -= way[:, None].astype(np.float32)
+            transforms = moved
     return SelectedMotion(taken, whole, first, numbers, transforms)
 
 

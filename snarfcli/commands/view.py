@@ -40,7 +40,7 @@ class ViewConfig(AvatarSelection, MotionSelection):
     """Settings of `snarf view`."""
 
     pose: list[str] = MISSING
-    """Motion files (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb) or folders of frames; the first is played."""
+    """Motion files (.npz of AMASS, .pkl of AIST++, .npy, .bvh, .glb, .vrma) or folders of frames; the first is played."""
     motion: str | None = MISSING
     """Built-in motion or sequence of the samples that is played first if there is no pose file; null for none."""
     surface: str = MISSING

@@ -71,15 +71,15 @@ class Character:
     """The content of a character file."""
 
     mesh: Mesh
-    """In the canonical frame, with normals and all weights."""
+    """In the pose that is stored, usually the canonical one, with normals and all weights."""
     joints: NDArray[np.int64]
     """[V, 4 or 8] joints that move a vertex."""
     weights: NDArray[np.float32]
     """[V, 4 or 8] their weights; rows sum to 1."""
     shapes: ShapeBasis
-    """K morph targets, whose weights are from 0 to 1; the base is that of `mesh`."""
+    """K morph targets, whose weights are from 0 to 1; the base is that of `mesh`, in the stored pose."""
     bind: NDArray[np.float64]
-    """[J, 4, 4] joint frames in the canonical pose."""
+    """[J, 4, 4] joint frames in the stored pose."""
     clips: list[CharacterClip]
     """The motions."""
     errors: CharacterErrors

@@ -10,13 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from snarfcli.bodies import Skeleton
-from snarfcli.bodies.skinning import skin_vertices
+from snarfcli.bodies.skinning import skin_vertices, transform_points
 from snarfcli.errors import UserError
 from snarfcli.export.character import Character, CharacterClip, CharacterErrors, CharacterOptions
 from snarfcli.export.clips import Clip, clip_transforms
 from snarfcli.export.influences import dense_weights, few_influences, trial_poses
 from snarfcli.export.morphs import ShapeBasis, fit_shapes, spread_frames
-from snarfcli.export.rig import LocalTransforms, bind_frames, decompose, local_frames, recompose
+from snarfcli.export.rig import LocalTransforms, Stance, canonical_stance, decompose, local_frames, recompose
+from snarfcli.export.stored_shape import stored_transforms
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh, vertex_normals
 from snarfcli.meshing.skinned import SkinnedSurface
@@ -35,7 +36,11 @@ _Frame = tuple[int, int]
 
 
 def build_character(
-    avatar: TrainedField, surface: SkinnedSurface, clips: Sequence[Clip], options: CharacterOptions
+    avatar: TrainedField,
+    surface: SkinnedSurface,
+    clips: Sequence[Clip],
+    options: CharacterOptions,
+    stance: Stance | None = None,
 ) -> Character:
     """Build a character from an avatar in motion.
 
@@ -44,27 +49,37 @@ def build_character(
         surface: its skinned surface, see `character_surface`.
         clips: at least one; repeated names get a number.
         options: limits on its size.
+        stance: pose of the stored mesh and joints; the canonical pose by default. In any other pose the mesh is stored as all
+            weights move it there, and linear blend skinning from there differs a little from the avatar's, which is part of
+            the deviation. Only with the canonical pose are the weights of the morph targets from 0 to 1; otherwise each
+            component has one target per direction, and the weights of the mean shape are 0.
 
     Raises:
         UserError: the shape cannot be followed in any frame.
     """
     mesh, parents = surface.mesh, avatar.skeleton.parents
     assert mesh.weights is not None
-    bind = bind_frames(avatar.skeleton)
+    is_canonical = stance is None
+    stance = canonical_stance(avatar.skeleton) if stance is None else stance
+    bind, frames = stance.frames, np.linalg.inv(stance.from_canonical) @ stance.frames
     transforms = [clip_transforms(avatar.skeleton, clip) for clip in clips]
-    local = [decompose(local_frames(moved @ bind, parents)) for moved in transforms]
+    local = [decompose(local_frames(moved @ frames, parents)) for moved in transforms]
     joints, weights = _fit_influences(avatar.skeleton, mesh, transforms, options.influences)
     shapes = _FrameShapes(surface, clips)
     basis = fit_shapes(shapes.sample(_MOST_POSES), options.morph_targets)
 
     few = dense_weights(joints, weights, len(parents))
+    picked = spread_frames([len(of_clip) for of_clip in transforms], _MOST_RIG_POSES)
+    poses = np.stack([transforms[clip][frame] for clip, frame in picked])
+    stored = None if is_canonical else stored_transforms(mesh.weights, few, poses, stance)
     skins = _Skins(
         exact=_Skin(mesh.weights, transforms),
         truncated=_Skin(few, transforms),
-        written=_Skin(few, [_read_back(moved, parents) @ np.linalg.inv(bind) for moved in local]),
+        written=_Skin(few, [_read_back(moved, parents) @ np.linalg.inv(bind) for moved in local], stored),
     )
     errors, shape_weights = _play(shapes, basis, skins)
-    basis, shape_weights = basis.within_unit_range(shape_weights)
+    basis, shape_weights = basis.within_unit_range(shape_weights) if is_canonical else basis.two_sided(shape_weights)
+    basis = basis if stored is None else _moved(basis, stored)
     names = unique_names(clip.motion.name or "clip" for clip in clips)
     return Character(
         mesh=Mesh(basis.base, mesh.faces, weights=mesh.weights, normals=vertex_normals(basis.base, mesh.faces)),
@@ -140,11 +155,14 @@ class _Skin:
     weights: NDArray
     """[V, J]."""
     transforms: Sequence[NDArray[np.float64]]
-    """Per clip [T, J, 4, 4], canonical to posed, metres."""
+    """Per clip [T, J, 4, 4], from the stored to the posed shape, metres."""
+    stored: NDArray[np.float64] | None = None
+    """[V, 3, 4] transform of each vertex from the canonical to the stored shape; None if the canonical shape is stored."""
 
     def posed(self, shape: NDArray, key: _Frame) -> NDArray:
         """Return a canonical shape [V, 3] posed as in a frame, [V, 3] metres."""
         clip, frame = key
+        shape = shape if self.stored is None else transform_points(self.stored, shape)
         return skin_vertices(shape, self.weights, self.transforms[clip][frame])
 
 
@@ -192,6 +210,13 @@ def _filled(weights: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.zeros_like(weights)
     times = np.arange(len(weights))
     return np.stack([np.interp(times, there, column[there]) for column in weights.T], axis=1).astype(np.float32)
+
+
+def _moved(basis: ShapeBasis, transforms: NDArray[np.float64]) -> ShapeBasis:
+    """Return a basis whose vertices were moved by transforms [V, 3, 4], and its targets with them."""
+    base = transform_points(transforms, basis.base)
+    targets = np.einsum("vab,kvb->kva", transforms[..., :3], basis.targets)
+    return ShapeBasis(base.astype(np.float32), targets.astype(np.float32), basis.rest)
 
 
 def _read_back(local: LocalTransforms, parents: Sequence[int]) -> NDArray[np.float64]:

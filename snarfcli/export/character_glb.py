@@ -6,6 +6,7 @@ Source: Khronos, glTF 2.0 specification, 3.7 (meshes, morph targets, skins) and 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from snarfcli.export.rig import decompose, local_frames
 from snarfcli.meshing.colors import from_srgb, weights_to_colors
 from snarfcli.meshing.mesh import vertex_normals
 
-__all__ = ["write_character"]
+__all__ = ["CharacterNodes", "character_glb", "write_character"]
 
 # Linear RGBA, as in glTF. Clay is light enough to show shading; it multiplies the colours of weights, so these need white.
 _CLAY = (0.62, 0.50, 0.42, 1.0)
@@ -28,8 +29,24 @@ _MOVES = {"translation": 1e-6, "rotation": 1e-7, "scale": 1e-6}
 """Paths of the channels of a node, and the largest difference from the value of the node that is rounding (metres, 1, 1)."""
 
 
+@dataclass(frozen=True)
+class CharacterNodes:
+    """Indices of the nodes of a character."""
+
+    mesh: int
+    """The skinned mesh."""
+    first_joint: int
+    """Joint 0; the others follow in order."""
+
+
 def write_character(
-    path: str | Path,
+    path: str | Path, character: Character, joint_names: Sequence[str], parents: Sequence[int], **more: Any
+) -> int:
+    """Write a character, whole or not at all, and return the size of the file in bytes; see `character_glb`."""
+    return character_glb(character, joint_names, parents, **more)[0].write(path)
+
+
+def character_glb(
     character: Character,
     joint_names: Sequence[str],
     parents: Sequence[int],
@@ -37,15 +54,14 @@ def write_character(
     name: str = "avatar",
     weight_colors: bool = False,
     facts: dict[str, Any] | None = None,
-) -> int:
-    """Write a character, whole or not at all.
+) -> tuple[GlbBuilder, CharacterNodes]:
+    """Return the content of a file with a character.
 
-    Nodes: the skinned mesh, a parent of all joints, and the joints in the canonical pose. y is up, the root joint has the
+    Nodes: the skinned mesh, a parent of all joints, and the joints in the stored pose. y is up, the root joint has the
     translation of the motion, units are metres. `extras.targetNames` of the mesh names the morph targets.
 
     Args:
-        path: the file.
-        character: the content of the file.
+        character: mesh, rig, clips and shapes.
         joint_names: names of the J joints.
         parents: parents of the J joints, -1 for a root.
         name: name of the mesh; the parent of all joints is called `name_rig`.
@@ -53,7 +69,7 @@ def write_character(
         facts: content of `asset.extras`.
 
     Returns:
-        Size of the file in bytes.
+        The file, to which more can be added before it is written, and its nodes.
     """
     builder = GlbBuilder(**(facts or {}))
     roots = [2 + joint for joint, parent in enumerate(parents) if parent < 0]
@@ -86,7 +102,7 @@ def write_character(
     moving["translation"][roots[0] - first] = moving["rotation"][roots[0] - first] = True
     for clip in character.clips:
         _add_clip(builder, clip, moving, first, mesh_node if len(character.shapes.targets) else None)
-    return builder.write(path)
+    return builder, CharacterNodes(mesh_node, first)
 
 
 def _add_mesh(builder: GlbBuilder, character: Character, name: str, weight_colors: bool) -> int:

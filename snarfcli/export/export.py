@@ -16,7 +16,7 @@ from snarfcli.export.character_surface import character_surface
 from snarfcli.export.clips import Clip
 from snarfcli.models.trained_field import TrainedField
 
-__all__ = ["ClipReport", "ExportReport", "check_output", "export_character"]
+__all__ = ["ClipReport", "ExportReport", "check_output", "export_character", "report_of"]
 
 log = logging.getLogger(__name__)
 
@@ -95,6 +95,7 @@ def export_character(
     options: CharacterOptions,
     *,
     name: str | None = None,
+    joint_names: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> ExportReport:
     """Write a rigged, animated character as `.glb`, whole or not at all.
@@ -105,6 +106,7 @@ def export_character(
         clips: motions, at least one.
         options: limits on the size of the character.
         name: name of the mesh; by default the subject of the avatar.
+        joint_names: names of the joints; by default those of the avatar's skeleton.
         overwrite: whether an existing file is replaced.
 
     Raises:
@@ -117,17 +119,17 @@ def export_character(
         raise UserError("clips: wanted at least one motion to export, got none; give a motion")
     surface = character_surface(avatar, options)
     character = build_character(avatar, surface, clips, options)
-    report = _report(path, character, options)
+    report = report_of(path, character, options)
     size = write_character(
         path,
         character,
-        avatar.skeleton.names,
+        joint_names or avatar.skeleton.names,
         avatar.skeleton.parents,
         name=name or str(avatar.facts.get("subject", "avatar")),
         weight_colors=options.weight_colors,
         facts={"snarf": report.facts()},
     )
-    return _report(path, character, options, size)
+    return report_of(path, character, options, size)
 
 
 def check_output(path: Path, overwrite: bool) -> None:
@@ -142,8 +144,8 @@ def check_output(path: Path, overwrite: bool) -> None:
         raise UserError(f"{path} exists already; give overwrite=true to replace it, or output=FILE")
 
 
-def _report(path: Path, character: Character, options: CharacterOptions, size: int = 0) -> ExportReport:
-    """Return the report of a character."""
+def report_of(path: Path, character: Character, options: CharacterOptions, size: int = 0) -> ExportReport:
+    """Return the report of a character in a file of `size` bytes."""
     return ExportReport(
         path=path,
         num_bytes=size,

@@ -57,6 +57,22 @@ class ShapeBasis:
         changed = ShapeBasis(self.shape(start), self.targets * span[:, None, None], (self.rest - start) / span)
         return changed, [((clip - start) / span).clip(0, 1) for clip in weights]
 
+    def two_sided(self, weights: Sequence[NDArray[np.float32]]) -> tuple[ShapeBasis, list[NDArray[np.float32]]]:
+        """Return an equivalent basis with one target per component and direction, and its weights, from 0 to 1.
+
+        With all weights at 0, as programs show a character that nobody drives, it has the mean shape. Directions that no clip
+        uses are left out.
+        """
+        if not len(self.targets):
+            return self, list(weights)
+        everything = np.concatenate(weights) - self.rest
+        spans = np.concatenate([everything.max(axis=0), -everything.min(axis=0)]).clip(0)
+        used = spans > _ROUNDING * spans.max()
+        both = np.concatenate([self.targets, -self.targets])[used] * spans[used, None, None]
+        sides = [np.concatenate([clip - self.rest, self.rest - clip], axis=1)[:, used] / spans[used] for clip in weights]
+        changed = ShapeBasis(self.shape(self.rest), both.astype(np.float32), np.zeros(len(both), np.float32))
+        return changed, [clip.clip(0, 1).astype(np.float32) for clip in sides]
+
 
 def spread_frames(lengths: Sequence[int], most: int) -> list[tuple[int, int]]:
     """Return at most `most` pairs (clip, frame), evenly spread over all clips together."""

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from snarfcli.bodies import Skeleton
 from snarfcli.bodies.kinematics import nearest_rotation
 
-__all__ = ["LocalTransforms", "bind_frames", "decompose", "local_frames", "recompose"]
+__all__ = ["LocalTransforms", "Stance", "bind_frames", "canonical_stance", "decompose", "local_frames", "recompose"]
 
 _IS_RIGID = 1e-5
 """Largest deviation of a scale from 1 that counts as rounding of float32."""
@@ -34,6 +34,21 @@ class LocalTransforms:
     """[T, J, 4] unit quaternions x, y, z, w; the sign is the one nearer to the frame before."""
     scale: NDArray[np.float64]
     """[T, J, 3]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stance:
+    """The pose in which a character is stored: its mesh, and its joints at rest."""
+
+    from_canonical: NDArray[np.float64]
+    """[J, 4, 4] bone transforms from the canonical pose, metres."""
+    frames: NDArray[np.float64]
+    """[J, 4, 4] joint frames in this pose, from joint to world, metres."""
+
+
+def canonical_stance(skeleton: Skeleton) -> Stance:
+    """Return the canonical pose as a stance."""
+    return Stance(np.tile(np.eye(4), (skeleton.num_joints, 1, 1)), bind_frames(skeleton))
 
 
 def bind_frames(skeleton: Skeleton) -> NDArray[np.float64]:

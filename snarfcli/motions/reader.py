@@ -25,11 +25,12 @@ from snarfcli.motions.retarget import choose_clip, retarget
 from snarfcli.motions.rig_rest import check_rest
 from snarfcli.motions.up_axis import UPS, Up
 
-__all__ = ["MOTION_SUFFIXES", "read_motion"]
+__all__ = ["MOTION_SUFFIXES", "RIG_SUFFIXES", "average_skeleton", "read_motion", "read_rig"]
 
 _ARRAY_SUFFIXES = (".npz", ".npy", ".pkl", ".pickle")
-_RIG_SUFFIXES = (".bvh", *GLTF_SUFFIXES)
-MOTION_SUFFIXES = (*_ARRAY_SUFFIXES, *_RIG_SUFFIXES)
+RIG_SUFFIXES = (".bvh", *GLTF_SUFFIXES)
+"""Suffixes of files with joints of their own, in lower case."""
+MOTION_SUFFIXES = (*_ARRAY_SUFFIXES, *RIG_SUFFIXES)
 """Suffixes of supported files, in lower case."""
 _MAX_FILES = 100_000  # in a folder with one pose per file: half an hour at 60 frames per second
 
@@ -85,29 +86,36 @@ def read_motion(
         raise ValueError(f"hands: wanted 'rest' or 'released', got {hands!r}")
     check_rest(rest)
     path = Path(path)
-    skeleton = _smpl_skeleton() if skeleton is None else skeleton
+    skeleton = average_skeleton() if skeleton is None else skeleton
     suffix = path.suffix.lower()
-    if suffix in _RIG_SUFFIXES and not path.is_dir():
-        rig = _read_rig(path, suffix)
+    if suffix in RIG_SUFFIXES and not path.is_dir():
+        rig = read_rig(path)
         chosen = choose_clip(rig, clip, path)
         name = path.stem if len(rig.clips) == 1 else f"{path.stem}_{chosen.name}"
         return retarget(rig, chosen, skeleton, path=path, name=name, up=up, rest=rest, mapping=mapping)
     for setting, value in (("mapping", mapping), ("clip", clip), ("rest", None if rest == "auto" else rest)):
         if value is not None:
-            raise UserError(
-                f"{setting}: wanted a file ending in {', '.join(_RIG_SUFFIXES)}, got pose file {path}; leave it out"
-            )
+            raise UserError(f"{setting}: wanted a file ending in {', '.join(RIG_SUFFIXES)}, got pose file {path}; leave it out")
     arrays = _read_arrays(path, suffix)
     name = path.name if path.is_dir() else path.stem
     return motion_from_arrays(arrays, skeleton, path, name=name, up=up, hands=hands)
 
 
-def _smpl_skeleton() -> Skeleton:
+def average_skeleton() -> Skeleton:
+    """Return SMPL's 24 joints for an average adult: the skeleton of the built-in motions, and of `read_motion` by default."""
     rest = torch.from_numpy(JOINTS_REST)
     return Skeleton(SMPL_JOINT_NAMES, PARENTS, rest, legs_apart_pose(SMPL_JOINT_NAMES, rest.dtype))
 
 
-def _read_rig(path: Path, suffix: str) -> Rig:
+def read_rig(path: str | Path) -> Rig:
+    """Read the joints and the clips of a file with joints of its own; see `RIG_SUFFIXES`.
+
+    Raises:
+        UserError: the file is missing, of another kind, or damaged.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in RIG_SUFFIXES:
+        raise UserError(f"{path}: wanted a file ending in {', '.join(RIG_SUFFIXES)}, which has joints of its own; give another")
     return read_bvh(path) if suffix == ".bvh" else read_gltf(path)
 
 

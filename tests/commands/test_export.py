@@ -13,6 +13,7 @@ import torch
 import trimesh
 from glb_reader import GlbReader
 from toy_character import JOINTS, ToyCharacter, wave
+from toy_human import ToyHuman
 
 from snarfcli.cli.main import main
 from snarfcli.commands import selection
@@ -287,8 +288,9 @@ def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["format=gltf"], "format: wanted glb, ply, obj, fbx or usd, got 'gltf'; did you mean"),
+        (["format=gltf"], "format: wanted glb, vrm, bvh, ply, obj, fbx or usd, got 'gltf'; did you mean"),
         (["influences=3"], "influences.* 4 or 8, got 3"),
+        (["format=vrm", "vrm.modification=all"], "vrm.modification: wanted prohibited, allowModification or"),
         (["triangles=50"], "triangles: wanted 100 to 5000000, got 50"),
         (["triangles=99999999"], "triangles: wanted "),
         (["morph_targets=65"], "morph_targets: wanted 0 to 64, got 65"),
@@ -332,6 +334,59 @@ def test_an_avatar_without_weights_is_rejected(folder, toy, capsys, monkeypatch)
     code, err = export(capsys, "--pose", pose_file("walk.npz"))
     assert code == 2
     assert "a rig needs skinning weights of canonical points, which model fast_snarf does not have" in err
+    assert not (folder / "export").exists()
+
+
+# ---------------------------------------------------------------- other names, and VRM
+@pytest.fixture
+def human(folder, monkeypatch) -> ToyHuman:
+    avatar = ToyHuman()
+    avatar.facts = {"subject": "50002"}
+    monkeypatch.setattr(selection.Avatar, "load", classmethod(lambda cls, path, device: avatar))
+    return avatar
+
+
+def test_joints_get_the_names_of_another_program(human, capsys):
+    code, err = export(capsys, "motion=[punching]", "max_frames=2", "names=mixamo", "morph_targets=0")
+    assert (code, err) == (0, "")
+    reader = GlbReader(Path("outputs/builtin/50002/fast_snarf/export/50002.glb"))
+    names = [reader.gltf.nodes[joint].name for joint in reader.skin.joints]
+    assert names[:3] == ["mixamorig:Hips", "mixamorig:LeftUpLeg", "mixamorig:RightUpLeg"]
+
+
+def test_a_vrm_model_and_its_motions(human, capsys, caplog):
+    place = Path("outputs/builtin/50002/fast_snarf/export")
+    arguments = ("format=vrm", "max_frames=2", "vrm.authors=[me]", "vrm.commercial_usage=corporation", "names=vrm")
+    with caplog.at_level(logging.INFO):
+        code, err = export(capsys, *arguments, "motion=[punching,lunges]")
+    assert (code, err) == (0, "")
+    files = ["50002.vrm", "50002_lunges.vrma", "50002_punching.vrma", "50002_vrm.json"]
+    assert sorted(path.name for path in place.iterdir()) == files
+    assert "clips in 50002_punching.vrma, 50002_lunges.vrma" in caplog.text
+    content = (place / "50002.vrm").read_bytes()
+    root = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    extension = root["extensions"]["VRMC_vrm"]
+    assert extension["meta"]["authors"] == ["me"]
+    assert extension["meta"]["commercialUsage"] == "corporation"
+    assert root["nodes"][extension["humanoid"]["humanBones"]["leftHand"]["node"]]["name"] == "leftHand"
+    record = json.loads((place / "50002_vrm.json").read_text())
+    assert record["clip_files"] == [files[2], files[1]]
+    (place / "50002.vrm").unlink()
+    (place / "50002_vrm.json").unlink()
+    code, err = export(capsys, *arguments, "motion=[punching,lunges]")
+    assert code == 2
+    assert "50002_punching.vrma exists already; give overwrite=true" in err
+    assert export(capsys, *arguments, "overwrite=true")[0] == 0
+    assert (place / "50002.vrma").exists()  # a single motion has the name of the model
+
+
+@pytest.mark.parametrize("arguments", [("format=vrm",), ("names=unreal",)], ids=" ".join)
+def test_what_is_no_human_is_a_line_at_once(folder, toy, capsys, monkeypatch, arguments):
+    monkeypatch.setattr(toy, "skinned_surface", None)  # nothing is made
+    code, err = export(capsys, "--pose", pose_file("walk.npz"), *arguments)
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert f"{arguments[0]}: wanted the skeleton of a human, got one without pelvis, " in err
     assert not (folder / "export").exists()
 
 

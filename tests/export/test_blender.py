@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 from glb_reader import SCRIPTS
-from toy_character import JOINTS, ToyCharacter, wave
+from toy_character import FRAME_RATE, JOINTS, ToyCharacter, stretched, wave
 
 from snarfcli.errors import UserError
 from snarfcli.export.blender import convert, find_blender
+from snarfcli.export.bvh import export_bvh
 from snarfcli.export.character import CharacterOptions
-from snarfcli.export.clips import Clip
+from snarfcli.export.clips import Clip, clip_transforms
 from snarfcli.export.export import export_character
 
 try:
@@ -58,6 +59,22 @@ def test_blender_gives_the_skinned_surface(tmp_path, suffix):
             pose, translation = (torch.from_numpy(part[frame]).float() for part in (clip.motion.poses, clip.motion.translation))
             error = np.linalg.norm(np.array(vertices) - surface.posed(pose, translation).vertices, axis=1).max()
             assert error < 5e-4 + 1e-3 * report.truncation_mm["max_mm"]
+
+
+@needs_blender
+@pytest.mark.parametrize("scale", [None, 1.0])  # without and with position channels
+def test_blender_reads_bvh(tmp_path, scale):
+    toy = ToyCharacter()
+    clip = Clip(wave()) if scale is None else stretched(wave(), toy, scale)
+    export_bvh(tmp_path / "worm.bvh", clip, toy.skeleton)
+    command = [*BLENDER, str(SCRIPTS / "blender_bvh.py"), "--", str(tmp_path / "worm.bvh"), repr(FRAME_RATE), *map(str, FRAMES)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("BLENDER ")] or [done.stdout + done.stderr]
+    transforms = clip_transforms(toy.skeleton, clip)
+    joints = toy.skeleton.canonical_joints.numpy()
+    for frame, heads in zip(FRAMES, json.loads(line.removeprefix("BLENDER "))["frames"], strict=True):
+        wanted = np.einsum("jab,jb->ja", transforms[frame, :, :3, :3], joints) + transforms[frame, :, :3, 3]
+        np.testing.assert_allclose([heads[name] for name in toy.skeleton.names], wanted, atol=1e-4)  # float32 in Blender
 
 
 @needs_blender

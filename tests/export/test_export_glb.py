@@ -7,11 +7,13 @@ import pytest
 import torch
 from glb_reader import GlbReader
 from toy_character import FRAME_RATE, ToyCharacter, stretched, wave
+from toy_human import ToyHuman
 from toy_training import avatar_config
 
 from snarfcli.avatar import Avatar
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.errors import UserError
+from snarfcli.motions import builtin_motion
 
 SMALL = {"triangles": None, "resolution": 32}
 
@@ -40,6 +42,16 @@ def test_the_file_shows_what_mesh_returns(avatar, tmp_path):
             wanted = avatar.mesh(pose, translation, resolution=32, surface="skinned").vertices
             error = np.linalg.norm(reader.vertices(motion.name, frame / FRAME_RATE) - wanted, axis=1).max()
             assert error < 5e-4 + 1e-3 * report.truncation_mm["max_mm"]
+
+
+def test_joints_of_humans_can_be_renamed(avatar, tmp_path):
+    few = {"resolution": 32, "triangles": 300, "morph_targets": 0}
+    motion = builtin_motion("punching", 0, frame_rate=10).slice(stop=2)
+    ToyHuman().export_glb(tmp_path / "a.glb", motion, names="unreal", **few)
+    reader = GlbReader(tmp_path / "a.glb")
+    assert reader.gltf.nodes[reader.skin.joints[1]].name == "thigh_l"
+    with pytest.raises(UserError, match="names=vrm: wanted the skeleton of a human"):
+        avatar.export_glb(tmp_path / "b.glb", wave(2), names="vrm", **few)
 
 
 def test_one_motion_or_clip_will_do(avatar, tmp_path):

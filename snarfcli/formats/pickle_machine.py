@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import codecs
+import math
 import struct
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from snarfcli.formats.pickle_numbers import checked_shape, dtype_of
 from snarfcli.formats.pickle_tree import Call, Name, PickleError, Raw, shown
 
 __all__ = ["PickleMachine", "plain_key"]
@@ -20,10 +22,10 @@ class PickleMachine:
     Every method raises `PickleError` for a damaged pickle or one that asks for more than plain data.
     """
 
-    def __init__(self, data: bytes, known: Mapping[tuple[str, str], str]) -> None:
+    def __init__(self, data: bytes, known: Mapping[tuple[str, str], str], start: int = 0) -> None:
         self.data, self.known = data, known
         self.view = memoryview(data)
-        self.at = 0
+        self.at = start
         self.stack: list[Any] = []
         self.marks: list[int] = []
         self.memo: dict[int, Any] = {}
@@ -144,6 +146,22 @@ class PickleMachine:
         if not isinstance(call, Call) or call.state is not None:
             raise self.damaged()
         call.state = state
+        if call.name.kind == "array in file":
+            call.args = (self.take_array(state),)
+
+    def take_array(self, state: Any) -> Raw:
+        """Take the bytes of an array that joblib writes into the pickle, behind the description of the array."""
+        if not isinstance(state, dict):
+            raise self.damaged()
+        size = math.prod(checked_shape(state.get("shape"))) * dtype_of(state.get("dtype")).itemsize
+        if state.get("numpy_array_alignment_bytes") is not None:
+            self.take(self.unpack("<B"))
+        return Raw(self.take(size), None)
+
+    def push_stored(self, key: Any) -> None:
+        if self.known.get(("", "stored")) is None:
+            raise PickleError("refers to an object outside the file, which plain data does not need")
+        self.stack.append(Call(Name("stored", "stored"), (key,)))
 
     def put(self, index: int) -> None:
         self.memo[index] = self.peek()

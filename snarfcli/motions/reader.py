@@ -6,31 +6,28 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, legs_apart_pose
 from snarfcli.errors import UserError
-from snarfcli.files import read_npy, read_npz
 from snarfcli.formats.bvh import read_bvh
 from snarfcli.formats.gltf import read_gltf
-from snarfcli.formats.pickles import read_pickle
 from snarfcli.formats.rig import Rig
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS
-from snarfcli.motions.arrays import MAX_POSE_BYTES, POSE_KEYS, motion_from_arrays
+from snarfcli.motions.arrays import motion_from_arrays
 from snarfcli.motions.layouts import HANDS
 from snarfcli.motions.motion import Motion
+from snarfcli.motions.pose_files import POSE_SUFFIXES, read_pose_sets
+from snarfcli.motions.pose_sets import choose_set
 from snarfcli.motions.retarget import choose_clip, retarget
 from snarfcli.motions.up_axis import UPS, Up
 
 __all__ = ["MOTION_SUFFIXES", "read_motion"]
 
-_ARRAY_SUFFIXES = (".npz", ".npy", ".pkl", ".pickle")
 _RIG_SUFFIXES = (".bvh", ".glb", ".gltf")
-MOTION_SUFFIXES = (*_ARRAY_SUFFIXES, *_RIG_SUFFIXES)
+MOTION_SUFFIXES = (*POSE_SUFFIXES, *_RIG_SUFFIXES)
 """Suffixes of supported files, in lower case."""
-_MAX_FILES = 100_000  # in a folder with one pose per file: half an hour at 60 frames per second
+_RIGS = f"a file ending in {', '.join(_RIG_SUFFIXES)}"
 
 
 def read_motion(
@@ -74,7 +71,7 @@ def read_motion(
         ValueError: `up` or `hands` is unknown.
     """
     if up not in UPS:
-        raise ValueError(f"up: wanted 'auto', 'y' or 'z', got {up!r}")
+        raise ValueError(f"up: wanted one of {', '.join(UPS)}, got {up!r}")
     if hands not in HANDS:
         raise ValueError(f"hands: wanted 'rest' or 'released', got {hands!r}")
     path = Path(path)
@@ -85,13 +82,20 @@ def read_motion(
         chosen = choose_clip(rig, clip, path)
         name = path.stem if len(rig.clips) == 1 else f"{path.stem}_{chosen.name}"
         return retarget(rig, chosen, skeleton, path=path, name=name, up=up, mapping=mapping)
-    for setting, value in (("mapping", mapping), ("clip", clip)):
-        if value is not None:
-            raise UserError(
-                f"{setting}: wanted a file ending in {', '.join(_RIG_SUFFIXES)}, got pose file {path}; leave it out"
-            )
-    arrays = _read_arrays(path, suffix)
+    if not path.exists():
+        raise UserError(f"no pose file at {path}")
+    if suffix not in POSE_SUFFIXES and not path.is_dir():
+        wanted = f"a file ending in {', '.join(MOTION_SUFFIXES)}, or a folder of .npz files"
+        raise UserError(f"pose file {path}: wanted {wanted}; convert it")
+    sets = read_pose_sets(path)
+    if clip is not None and len(sets) == 1:
+        raise UserError(f"clip: wanted {_RIGS}, got pose file {path} with one motion; leave it out")
+    arrays = choose_set(sets, clip, path)
     name = path.name if path.is_dir() else path.stem
+    if len(sets) > 1:
+        name = "_".join([name, *re.split(r"[/ ]+", arrays.label)])
+    if mapping is not None:
+        raise UserError(f"mapping: wanted {_RIGS}, got pose file {path}; leave it out")
     return motion_from_arrays(arrays, skeleton, path, name=name, up=up, hands=hands)
 
 
@@ -102,80 +106,3 @@ def _smpl_skeleton() -> Skeleton:
 
 def _read_rig(path: Path, suffix: str) -> Rig:
     return read_bvh(path) if suffix == ".bvh" else read_gltf(path)
-
-
-def _read_arrays(path: Path, suffix: str) -> dict[str, NDArray]:
-    """Return the arrays of a file or folder, with the names of AMASS and AIST++."""
-    if path.is_dir():
-        return _read_folder(path)
-    if suffix == ".npz":
-        return read_npz(path, "pose file", only=POSE_KEYS, max_bytes=MAX_POSE_BYTES)
-    if suffix == ".npy":
-        return {"poses": read_npy(path, "pose file", max_bytes=MAX_POSE_BYTES)}
-    if suffix in (".pkl", ".pickle"):
-        return _from_pickle(path)
-    if not path.exists():
-        raise UserError(f"no pose file at {path}")
-    wanted = f"a file ending in {', '.join(MOTION_SUFFIXES)}, or a folder of .npz files"
-    raise UserError(f"pose file {path}: wanted {wanted}; convert it")
-
-
-def _from_pickle(path: Path) -> dict[str, NDArray]:
-    content = read_pickle(path, "pose file")
-    if not isinstance(content, dict):
-        raise UserError(f"pose file {path}: wanted a dict with smpl_poses, as in AIST++, got {type(content).__name__}")
-    arrays = {}
-    for key in POSE_KEYS:
-        value = content.get(key) if key not in ("gender", "up") else None  # these are text
-        if isinstance(value, (np.ndarray, int, float)):
-            arrays[key] = np.asarray(value)
-        elif value is not None:
-            raise UserError(f"pose file {path}: {key}: wanted an array, got {type(value).__name__}; repair the file")
-    return arrays
-
-
-def _read_folder(path: Path) -> dict[str, NDArray]:
-    """Return the poses of a folder with one file per frame, sorted by the numbers in the file names."""
-    try:
-        files = [file for file in path.iterdir() if file.suffix.lower() == ".npz" and not file.name.startswith(".")]
-    except OSError as error:
-        raise UserError(f"folder {path} cannot be read ({error.strerror or error})") from None
-    if not files:
-        raise UserError(f"folder {path} has no .npz files; give a pose file, or a folder with one per frame")
-    if len(files) > _MAX_FILES:
-        raise UserError(f"folder {path}: wanted at most {_MAX_FILES} .npz files, got {len(files)}; give a part of them")
-    files.sort(key=_natural)
-    frames = [_read_frame(file) for file in files]
-    arrays: dict[str, NDArray] = {}
-    for key in dict.fromkeys(key for frame in frames for key in frame):
-        first = next(frame[key] for frame in frames if key in frame)
-        for file, frame in zip(files, frames, strict=True):
-            if key not in frame or frame[key].shape != first.shape:
-                raise UserError(f"pose file {file}: {key} is missing or has another shape than in other files; repair it")
-        arrays[key] = np.stack([frame[key] for frame in frames]) if key in ("pose", "trans") else first
-    return arrays
-
-
-def _read_frame(file: Path) -> dict[str, NDArray]:
-    """Return `pose` [values] of one file and, if present, `trans` [3] and a frame rate."""
-    arrays = read_npz(file, "pose file", only=POSE_KEYS, max_bytes=MAX_POSE_BYTES)
-    frame = {}
-    for name, keys in (("pose", ("pose", "poses")), ("trans", ("trans", "transl"))):
-        key = next((key for key in keys if key in arrays), None)
-        if key is None:
-            continue
-        array = arrays[key]
-        if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-            raise UserError(f"pose file {file}: {key}: wanted finite numbers, got others; repair or remove the file")
-        if name == "pose" and (array.size > 3 * 1000 or (array.ndim > 1 and array.shape[0] > 1 and array.shape[1] != 3)):
-            raise UserError(f"pose file {file}: wanted one pose, got more; name a file, or a folder with one pose per file")
-        frame[name] = array.ravel()
-    if "pose" not in frame:
-        raise UserError(f"pose file {file} has no 'pose'; add it to every .npz file of the folder")
-    return frame | {key: arrays[key] for key in ("mocap_framerate", "mocap_frame_rate", "frame_rate", "fps") if key in arrays}
-
-
-def _natural(file: Path) -> list[tuple[int, int, str]]:
-    """Return a sort key that compares numbers in names by value."""
-    parts = re.split(r"([0-9]+)", file.name)
-    return [(1, int(part), part) if at % 2 else (0, 0, part) for at, part in enumerate(parts)]

@@ -27,7 +27,7 @@ from snarfcli.motions.layouts import layout_of
 from snarfcli.motions.mapping import map_joints
 from snarfcli.motions.motion import Motion
 from snarfcli.motions.rest_poses import RestMatch, rest_turns
-from snarfcli.motions.up_axis import Up, up_axis, y_from_z_up
+from snarfcli.motions.up_axis import Up, up_axis, y_from_up
 
 __all__ = ["choose_clip", "retarget"]
 
@@ -113,7 +113,7 @@ def retarget(
     axis = _up(root, turns[0]) if up == "auto" else up
     if up == "auto" and axis == "z":
         log.info("%s: z is up in this file and was turned to y", path.name)
-    upright = y_from_z_up().as_matrix() if axis == "z" else np.eye(3)
+    upright = np.eye(3) if axis == "y" else y_from_up(axis).as_matrix()
 
     rotations = {joint: upright @ _turned(rig, clip, number, path) @ turns[joint] for joint, number in pairs.items()}
     poses = _local_poses(rotations, skeleton.parents, len(clip.world_from_joint))

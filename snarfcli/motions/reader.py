@@ -16,6 +16,7 @@ from snarfcli.formats.rig import Rig
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS
 from snarfcli.motions.arrays import motion_from_arrays
 from snarfcli.motions.layouts import HANDS
+from snarfcli.motions.mhr_motion import motion_from_mhr
 from snarfcli.motions.motion import Motion
 from snarfcli.motions.pose_files import POSE_SUFFIXES, read_pose_sets
 from snarfcli.motions.pose_sets import choose_set
@@ -94,6 +95,8 @@ def read_motion(
     name = path.name if path.is_dir() else path.stem
     if len(sets) > 1:
         name = "_".join([name, *re.split(r"[/ ]+", arrays.label)])
+    if "mhr_rotations" in arrays.found and "poses" not in arrays.found:
+        return motion_from_mhr(arrays, skeleton, path, name=name, up=up, mapping=mapping)
     if mapping is not None:
         raise UserError(f"mapping: wanted {_RIGS}, got pose file {path}; leave it out")
     return motion_from_arrays(arrays, skeleton, path, name=name, up=up, hands=hands)

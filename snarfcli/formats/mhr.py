@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from snarfcli.formats.rig import Rig, RigClip
 
-__all__ = ["MHR_JOINTS", "mhr_rig"]
+__all__ = ["MHR_JOINTS", "MhrTable", "mhr_rig"]
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ _ALONG_X = ("l_upleg", "l_lowleg", "l_uparm", "l_lowarm")  # joints whose only c
 _MAX_DEVIATION = 0.2  # of a unit vector; body shapes move the axis of the thigh by 0.02
 
 
-class _Table:
+class MhrTable:
     """The joints that are kept: numbers in MHR, names, parents and orientations at rest."""
 
     def __init__(self) -> None:
@@ -99,7 +99,7 @@ def mhr_rig(rotations: Array, positions: Array, frame_rate: float, name: str) ->
     Raises:
         ValueError: the rotations are none, or do not belong to the positions.
     """
-    table = _Table()
+    table = MhrTable()
     turns, places = rotations[:, table.numbers], positions[:, table.numbers]
     error = np.abs(turns @ turns.transpose(0, 1, 3, 2) - np.eye(3)).max()
     if error > 1e-3 or np.linalg.det(turns).min() < 0:
@@ -120,7 +120,7 @@ def mhr_rig(rotations: Array, positions: Array, frame_rate: float, name: str) ->
     return Rig(table.names, table.parents, rest, (RigClip(name, frame_rate, world),))
 
 
-def _deviation(table: _Table, turns: Array, places: Array) -> float:
+def _deviation(table: MhrTable, turns: Array, places: Array) -> float:
     """Return the median distance between the x axes of the left limbs and the directions to their children, as unit vectors."""
     distances = []
     for name in _ALONG_X:

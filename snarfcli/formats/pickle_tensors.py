@@ -17,7 +17,8 @@ __all__ = ["ESTIMATE_NAMES", "EstimateReading", "value_size"]
 # Number types of PyTorch's storages. bfloat16, the upper half of a float32, is not a type of NumPy.
 _STORAGES = {
     "DoubleStorage": "f8", "FloatStorage": "f4", "HalfStorage": "f2", "BFloat16Storage": "bfloat16",
-    "LongStorage": "i8", "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1", "BoolStorage": "u1",
+    "LongStorage": "i8", "IntStorage": "i4", "ShortStorage": "i2", "CharStorage": "i1", "ByteStorage": "u1",
+    "BoolStorage": "u1",
 }  # fmt: skip
 
 ESTIMATE_NAMES = {
@@ -107,10 +108,11 @@ class EstimateReading(Reading):
         if len(args) < 4:
             raise odd(name)
         storage, first, size, strides = (self.value(part, depth) for part in args[:4])
-        counts = [first, *size, *strides] if isinstance(size, tuple) and isinstance(strides, tuple) else [None]
-        if not isinstance(storage, np.ndarray) or storage.ndim != 1 or any(type(n) is not int or n < 0 for n in counts):
+        if not isinstance(storage, np.ndarray) or storage.ndim != 1 or type(first) is not int or not 0 <= first < 2**40:
             raise odd(name)
-        if len(size) != len(strides) or len(size) > 32 or max(counts) >= 2**40:
+        if not isinstance(size, tuple) or not isinstance(strides, tuple) or len(size) != len(strides) or len(size) > 32:
+            raise odd(name)
+        if any(type(n) is not int or not 0 <= n < 2**40 for n in (*size, *strides)):
             raise odd(name)
         count = math.prod(size)
         self.spend(count * storage.itemsize)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,7 @@ def frame_rate_of(arrays: PoseSet, path: Path) -> float:
     if "frame_rate" in arrays.found:
         key, value = arrays.found["frame_rate"]
         return _positive(value, key, path)
-    usual = VIDEO_FRAME_RATE if arrays.frame else DEFAULT_FRAME_RATE
+    usual = VIDEO_FRAME_RATE if arrays.frame or arrays.is_video else DEFAULT_FRAME_RATE
     log.info("%s: no frame rate given, %g frames per second assumed", path.name, usual)
     return usual
 
@@ -125,7 +126,7 @@ def _declared_up(arrays: PoseSet) -> Up:
     """Return the up axis that the file declares; `auto` if it does not."""
     value = arrays.found.get("up", ("", ""))[1]
     word = str(value.ravel()[0] if isinstance(value, np.ndarray) and value.size else value)
-    return next((up for up in UPS if up == word), "auto")
+    return cast(Up, word) if word in UPS else "auto"
 
 
 def _has_y_up(arrays: PoseSet) -> bool:
@@ -146,10 +147,11 @@ def _is_amass(arrays: PoseSet) -> bool:
 
 def _placed(poses: Array, arrays: PoseSet, root_rest: Array, path: Path) -> tuple[Array, Array]:
     """Return poses and translation of a posed body that is then rotated about the origin and moved, as in EasyMocap."""
-    turns, way = (numbers(arrays.found[role][1], arrays.found[role][0], path) for role in ("placed_rotation", "placed_translation"))
+    (key, rotations), (other, places) = arrays.found["placed_rotation"], arrays.found["placed_translation"]
+    turns, way = numbers(rotations, key, path), numbers(places, other, path)
     if turns.size != 3 * len(poses) or way.size != 3 * len(poses):
-        key = arrays.found["placed_rotation"][0]
-        raise UserError(f"pose file {path}: {key}: wanted shape [{len(poses)}, 3], got {list(turns.shape)}; repair the file")
+        got = f"{list(turns.shape)} and {list(way.shape)}"
+        raise UserError(f"pose file {path}: {key}, {other}: wanted shape [{len(poses)}, 3], got {got}; repair the file")
     rotation = Rotation.from_rotvec(turns.reshape(-1, 3))
     poses = poses.copy()
     poses[:, 0] = (rotation * Rotation.from_rotvec(poses[:, 0])).as_rotvec()

@@ -51,8 +51,10 @@ def motion_from_mhr(
     frames = len(turns) if turns.ndim == 4 else 1
     for values, label, last in ((turns, key, (MHR_JOINTS, 3, 3)), (places, other, (MHR_JOINTS, 3))):
         if values.size != frames * np.prod(last) or values.shape[-len(last) :] != last or not frames:
-            shape = list(values.shape)
-            raise UserError(f"pose file {path}: {label}: wanted shape {['frames', *last]}, got {shape}; repair the file")
+            wanted = ", ".join(map(str, last))
+            raise UserError(
+                f"pose file {path}: {label}: wanted shape [frames, {wanted}], got {list(values.shape)}; repair the file"
+            )
     turns, places = turns.reshape(frames, MHR_JOINTS, 3, 3), places.reshape(frames, MHR_JOINTS, 3)
     place = place_of(arrays, frames, path)
     if place is not None:

@@ -6,18 +6,18 @@ import re
 from collections.abc import Iterable
 from typing import Literal
 
-__all__ = ["CONTAINER_KEYS", "FRAME_RATES", "POSES", "TRANSLATIONS", "Frame", "frame_of", "is_of_camera", "listed_keys", "role_of"]
+__all__ = ["CONTAINER_KEYS", "FRAME_RATES", "Frame", "frame_of", "is_of_camera", "listed_keys", "role_of"]
 
 Frame = Literal["", "world", "camera"]
 """Frame that a name mentions; empty if it mentions none."""
 
 # Names by role, the preferred first. AMASS, CAPE, AIST++; MoSh++ and MOYO; ROMP; TRAM and PromptHMR.
-POSES = ("poses", "pose", "smpl_poses", "fullpose", "full_pose", "smpl_thetas", "pose_aa", "rotmat")
-TRANSLATIONS = ("trans", "transl", "translation", "smpl_trans", "cam_trans", "cam_t")
+_POSES = ("poses", "pose", "smpl_poses", "fullpose", "full_pose", "smpl_thetas", "pose_aa", "rotmat")
+_TRANSLATIONS = ("trans", "transl", "translation", "smpl_trans", "cam_trans", "cam_t")
 FRAME_RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "fps")
 _ROLES = {
-    "poses": POSES,
-    "trans": TRANSLATIONS,
+    "poses": _POSES,
+    "trans": _TRANSLATIONS,
     "frame_rate": FRAME_RATES,
     "scaling": ("smpl_scaling",),
     "up": ("up",),
@@ -39,11 +39,13 @@ _ROLES = {
 _KEYS = {key: (role, rank) for role, keys in _ROLES.items() for rank, key in enumerate(keys)}
 _PREFIXES = ("pred_", "smpl_", "smplx_", "smplh_")
 _FRAMES: dict[str, Frame] = {
-    **dict.fromkeys(("world", "global", "w"), "world"),
-    **dict.fromkeys(("incam", "camera", "cam", "c"), "camera"),
+    "world": "world", "global": "world", "w": "world",
+    "incam": "camera", "camera": "camera", "cam": "camera", "c": "camera",
 }  # fmt: skip
 _CAMERA = re.compile(r"(pred_|pd_)?(cam|camera|cams)(_.*)?|focal.*|.*intrin.*|k_fullimg")
-CONTAINER_KEYS = frozenset(("results", "sequence_results", "smpl", "smplx", "smpl_params", "params", "data", "outputs", "arr_0"))
+CONTAINER_KEYS = frozenset(
+    ("results", "sequence_results", "smpl", "smplx", "smpl_params", "smplx_params", "params", "data", "outputs", "arr_0")
+)
 """Names of arrays of an `.npz` file that may hold dictionaries with poses."""
 _MAX_LETTERS = 200
 _CHANGED = 100  # rank of a name with a prefix or an ending: after all without
@@ -84,7 +86,8 @@ def _without_prefixes(name: str) -> str:
 def frame_of(name: str) -> Frame:
     """Return the frame that the name of a group of arrays mentions, such as world for `smpl_params_global`."""
     words = re.split(r"[_\W]+", name.lower())
-    return next((_FRAMES[word] for word in words if len(word) > 1 and word in _FRAMES), "")
+    named: list[Frame] = [_FRAMES[word] for word in words if len(word) > 1 and word in _FRAMES]
+    return named[0] if named else ""
 
 
 def is_of_camera(keys: Iterable[object]) -> bool:

@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 _MAX_DEPTH = 8
 _MAX_NODES = 200_000
 _MAX_SETS = 100_000
+_MAX_VALUES = 2**24
 _PICTURE = re.compile(r".*\.(jpe?g|png|bmp|tiff?|webp|npz|npy|pkl|pickle|pt|pth)", re.IGNORECASE)
 _PERSON_IDS = ("track_ids", "tracked_ids", "tid", "person_ids", "ids")
 _DETECTIONS = ("center_confs", "center_preds")  # ROMP's result of one picture: the first axis is that of the persons
@@ -37,13 +38,20 @@ class PoseSet:
     label: str
     """Where they are in the file, for example `smpl_params_global` or `0/world`."""
     found: Found
-    """The arrays by role."""
+    """The arrays by role; of single pictures and as some files have them, a list with one array per frame."""
     frame: Frame
     """Frame of reference, as far as names tell."""
     depth: int
     """Number of containers around the arrays."""
+    is_video: bool = False
+    """Whether the frames were single pictures."""
     missing: int = 0
-    """Number of frames of the video in which this person was not found; they are left out."""
+    """Number of pictures in which this person was not found; they are left out."""
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether there are poses, as a whole or in parts; otherwise there are joints of MHR."""
+        return "poses" in self.found or {"root", "body"} <= {*self.found}
 
 
 def find_sets(content: Any) -> list[PoseSet]:
@@ -81,8 +89,20 @@ def choose_set(sets: Sequence[PoseSet], clip: str | int | None, path: Path) -> P
     else:
         raise UserError(f"{path} has no motion {str(clip)[:40]!r}{nearest(str(clip), labels) or '.'} It has {shown}")
     if chosen.missing > 0:
-        log.info("%s: the person is missing in %d frames, which were left out", path.name, chosen.missing)
-    return chosen
+        log.info("%s: frames without this person were left out: %d", path.name, chosen.missing)
+    return replace(chosen, found={role: (key, _stacked(value, key, path)) for role, (key, value) in chosen.found.items()})
+
+
+def _stacked(value: Any, key: str, path: Path) -> Any:
+    """Return a list of arrays, one per frame, as one array; any other value unchanged."""
+    if not isinstance(value, list) or not all(isinstance(item, np.ndarray) for item in value) or not value:
+        return value
+    count = sum(item.size for item in value)
+    if count > _MAX_VALUES:
+        raise UserError(f"pose file {path}: {key}: wanted at most {_MAX_VALUES} values, got {count}; cut it into parts")
+    if any(item.size != value[0].size for item in value):
+        raise UserError(f"pose file {path}: {key}: wanted arrays of one size in all frames, got others; repair the file")
+    return np.stack([item.reshape(value[0].shape) for item in value])
 
 
 class _Walk:
@@ -109,18 +129,23 @@ class _Walk:
         are_frames = len(node) > 0 and all(isinstance(key, str) and _PICTURE.fullmatch(key) for key in node)
         self.pictures += len(node) if are_frames and not is_frame else 0
         for key, child in node.items():
+            if self.nodes > _MAX_NODES:
+                return
+            name = _printable(key)
             ids = _ids(node, len(child)) if is_frame and isinstance(child, (list, tuple)) else None
             if ids is not None:
                 for number, item in zip(ids, child, strict=True):
-                    self.visit(item, (*path, str(key)[:40], number), shared, is_frame)
+                    self.visit(item, (*path, name, number), shared, is_frame)
             else:
-                self.visit(child, path if are_frames else (*path, str(key)[:40]), shared, is_frame or are_frames)
+                self.visit(child, path if are_frames else (*path, name), shared, is_frame or are_frames)
 
     def visit_list(self, node: Sequence[Any], path: tuple[str, ...], above: Found, is_frame: bool) -> None:
         # A list of lists has frames of persons; a list of dictionaries has persons.
         are_frames = len(node) > 1 and all(isinstance(item, (list, tuple)) for item in node)
         self.pictures += len(node) if are_frames and not is_frame else 0
         for number, item in enumerate(node):
+            if self.nodes > _MAX_NODES:
+                return
             alone = len(node) == 1 and not is_frame
             self.visit(item, path if are_frames or alone else (*path, str(number)), above, is_frame or are_frames)
 
@@ -143,8 +168,13 @@ def _ids(node: Mapping[Any, Any], count: int) -> list[str] | None:
         ids = node.get(key)
         ids = ids.ravel().tolist() if isinstance(ids, np.ndarray) and ids.size <= _MAX_SETS else ids
         if isinstance(ids, (list, tuple)) and len(ids) == count and all(isinstance(one, (int, float, str)) for one in ids):
-            return [f"person {one:g}" if isinstance(one, (int, float)) else one[:40] for one in ids]
+            return [f"person {one:g}" if isinstance(one, (int, float)) else _printable(one) for one in ids]
     return None
+
+
+def _printable(key: object) -> str:
+    """Return the name of a container for labels: at most 40 printable characters without a slash."""
+    return "".join(letter if letter.isprintable() and letter != "/" else "?" for letter in str(key)[:40])
 
 
 def _by_role(node: Mapping[Any, Any], frame: Frame) -> Found:
@@ -167,14 +197,14 @@ def _sets_of(node: Mapping[Any, Any], path: tuple[str, ...], shared: Found) -> I
     """Yield the sets whose arrays are in one dictionary."""
     plain = _by_role(node, "")
     parts = {role: pair for role, pair in plain.items() if role not in ("poses", "root", "trans")}
-    named: Frame = next((frame_of(part) for part in reversed(path) if frame_of(part)), "")
+    named: list[Frame] = [frame_of(part) for part in reversed(path) if frame_of(part)]
     groups: list[tuple[Frame, str, Found]] = []
     for frame in ("world", "camera"):
         framed = _by_role(node, frame)
         if "poses" in framed or "root" in framed:
             groups.append((frame, frame, {**shared, **parts, **framed}))
     has_world = any(frame == "world" for frame, _, _ in groups)
-    guess: Frame = named or ("camera" if has_world or is_of_camera(node) else "")
+    guess: Frame = named[0] if named else "camera" if has_world or is_of_camera(node) else ""
     groups.append((guess, guess if groups else "", {**shared, **plain}))
     for frame, name, found in groups:
         if _is_complete(found):
@@ -190,13 +220,11 @@ def _persons(each: PoseSet, of_pictures: bool) -> list[PoseSet]:
     """
     role = next(role for role in ("poses", "body", "mhr_rotations") if role in each.found)
     main = each.found[role][1]
-    if isinstance(main, list):
-        count = len(main)
-    elif isinstance(main, np.ndarray) and lead_axes(role, main) >= (1 if of_pictures else 2):
-        count = len(main)
-    else:
+    is_list = isinstance(main, list) and all(isinstance(item, np.ndarray) and item.ndim > 1 for item in main)
+    has_axis = isinstance(main, np.ndarray) and lead_axes(role, main) >= (1 if of_pictures else 2)
+    if not is_list and not has_axis:
         return [each]
-    return [_person(each, number, count) for number in range(min(count, _MAX_SETS))]
+    return [_person(each, number, len(main)) for number in range(min(len(main), _MAX_SETS))]
 
 
 def _person(each: PoseSet, number: int, count: int) -> PoseSet:
@@ -215,26 +243,22 @@ def _joined(frames: Mapping[str, list[PoseSet]], pictures: int) -> Iterator[Pose
         pictures: number of frames in the file.
     """
     for label, sets in frames.items():
-        roles = [role for role in sets[0].found if all(role in each.found for each in sets)]
         found: Found = {}
-        for role in roles:
-            key, first = sets[0].found[role]
-            values = [each.found[role][1] for each in sets]
+        for role, (key, first) in sets[0].found.items():
             if role in ("frame_rate", "up"):
                 found[role] = key, first
-            elif all(isinstance(value, np.ndarray) and value.size == first.size for value in values):
-                found[role] = key, np.stack([value.reshape(values[0].shape) for value in values])
+            elif all(role in each.found for each in sets):
+                found[role] = key, [each.found[role][1] for each in sets]
         if _is_complete(found):
-            yield replace(sets[0], label=label, found=found, missing=pictures - len(sets))
+            yield replace(sets[0], label=label, found=found, is_video=True, missing=pictures - len(sets))
 
 
 def _plain(value: Any) -> Any:
-    """Return numbers and lists of numbers as an array, and a list of arrays as one array per person."""
+    """Return numbers and lists of numbers as an array, and several arrays as a list; any other value unchanged."""
     if isinstance(value, (np.ndarray, str)):
         return value
     if isinstance(value, (list, tuple)) and len(value) and all(isinstance(item, np.ndarray) for item in value):
-        alike = all(item.shape == value[0].shape for item in value)
-        return np.stack(value) if alike and value[0].ndim < 2 else list(value)
+        return list(value)
     try:
         return np.array(value, np.float64)
     except (ValueError, TypeError, OverflowError):

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 _ENDS = np.arange(1, 22)
 _STARTS = np.array(PARENTS[1:22])
 _LENGTHS = np.linalg.norm(JOINTS_REST[_ENDS] - JOINTS_REST[_STARTS], axis=1)
-# Standard deviation of the logarithm of measured over average bone lengths: at most 0.07 for the built-in subjects, and at least
+# Standard deviation of the logarithm of measured over average bone lengths: at most 0.07 for the built-in subjects, at least
 # 0.32 for the axis-angle vectors of 240,000 random and 10,000 recorded and built-in poses.
 _PROPORTIONS = 0.25
 # A distance is constant if its standard deviation is below this times the square of the angle (rad) by which its direction
@@ -40,7 +40,7 @@ def are_positions(values: Array) -> bool:
     Args:
         values: [T, K, 3], in any unit and frame.
     """
-    return _has_proportions(values) or _is_rigid(values)
+    return values.size > 0 and (_has_proportions(values) or _is_rigid(values))
 
 
 def _has_proportions(values: Array) -> bool:

@@ -94,8 +94,8 @@ def read_motion(
     arrays = choose_set(sets, clip, path)
     name = path.name if path.is_dir() else path.stem
     if len(sets) > 1:
-        name = "_".join([name, *re.split(r"[/ ]+", arrays.label)])
-    if "mhr_rotations" in arrays.found and "poses" not in arrays.found:
+        name = f"{name}_{re.sub(r'[^0-9A-Za-z.-]+', '_', arrays.label)}"
+    if not arrays.has_poses:
         return motion_from_mhr(arrays, skeleton, path, name=name, up=up, mapping=mapping)
     if mapping is not None:
         raise UserError(f"mapping: wanted {_RIGS}, got pose file {path}; leave it out")

@@ -14,6 +14,8 @@ from snarfcli.formats.pickle_tree import Call, Name, PickleError, Raw, shown
 __all__ = ["PickleMachine", "plain_key"]
 
 _NUMBER_LENGTH = 100  # bytes of a number
+# What is accepted besides names: objects outside the file, and any other name.
+_STORED, _UNKNOWN = ("", "stored"), ("", "unknown")
 
 
 class PickleMachine:
@@ -119,7 +121,7 @@ class PickleMachine:
     def push_name(self, module: str | bytes, name: str | bytes) -> None:
         # A name that is not ASCII is never a known one.
         module, name = (str(part, "ascii", "replace") if isinstance(part, bytes) else part for part in (module, name))
-        kind = self.known.get((module, name))
+        kind = self.known.get((module, name), self.known.get(_UNKNOWN))
         if kind is None:
             raise PickleError(f"asks for {shown(module)}.{shown(name)}, which plain data does not need; nothing was executed")
         self.stack.append(Name(f"{module}.{name}", kind))
@@ -132,6 +134,8 @@ class PickleMachine:
 
     def push_call(self) -> None:
         args, name = self.pop(), self.pop()
+        if isinstance(name, Call) and name.name.kind in ("unknown", "stored"):  # such as the class of a model of PyTorch
+            name = Name(name.name.path, "unknown")
         if not isinstance(name, Name) or not isinstance(args, tuple):
             raise self.damaged()
         self.stack.append(Call(name, args))
@@ -159,7 +163,7 @@ class PickleMachine:
         return Raw(self.take(size), None)
 
     def push_stored(self, key: Any) -> None:
-        if self.known.get(("", "stored")) is None:
+        if _STORED not in self.known:
             raise PickleError("refers to an object outside the file, which plain data does not need")
         self.stack.append(Call(Name("stored", "stored"), (key,)))
 
@@ -185,6 +189,8 @@ class PickleMachine:
 
     def append(self, values: list) -> None:
         target = self.peek()
+        if isinstance(target, Call) and target.name.kind == "unknown":
+            return
         if type(target) is not list:
             raise self.damaged()
         target.extend(values)
@@ -197,6 +203,8 @@ class PickleMachine:
 
     def set_items(self, values: list) -> None:
         target = self.peek()
+        if isinstance(target, Call) and target.name.kind == "unknown":
+            return
         if isinstance(target, Call):
             target = target.items
         if type(target) is not dict:

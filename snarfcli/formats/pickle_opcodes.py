@@ -33,7 +33,8 @@ def read_tree_at(data: bytes, known: Mapping[tuple[str, str], str], start: int) 
     Args:
         data: bytes of the file.
         known: kind of each accepted (module, name), which becomes `Name.kind`; other names raise. With ("", "stored"),
-            references to objects outside the pickle become a `Call` of that kind.
+            references to objects outside the pickle become a `Call` of that kind; with ("", "unknown"), other names are
+            accepted and have that kind.
         start: first byte of the pickle.
 
     Returns:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.formats.pickle_tree import Call, Name, PickleError, shown
+from snarfcli.formats.pickle_tree import Call, Name, PickleError, Unknown, shown
 from snarfcli.formats.pickle_values import KNOWN_NAMES, Reading, odd
 
 __all__ = ["ESTIMATE_NAMES", "EstimateReading", "value_size"]
+
+log = logging.getLogger(__name__)
 
 # Number types of PyTorch's storages. bfloat16, the upper half of a float32, is not a type of NumPy.
 _STORAGES = {
@@ -24,6 +28,7 @@ _STORAGES = {
 ESTIMATE_NAMES = {
     **KNOWN_NAMES,
     ("", "stored"): "stored",
+    ("", "unknown"): "unknown",
     ("torch._utils", "_rebuild_tensor"): "tensor",
     ("torch._utils", "_rebuild_tensor_v2"): "tensor",
     ("torch._utils", "_rebuild_parameter"): "parameter",
@@ -58,7 +63,10 @@ def _code(kind: Any) -> str:
 
 
 class EstimateReading(Reading):
-    """Conversion of the tree of an estimator's pickle to plain data; tensors become arrays that own their memory."""
+    """Conversion of the tree of an estimator's pickle to plain data; tensors become arrays that own their memory.
+
+    Objects of unknown classes, such as settings beside the poses, become `Unknown`; `unknown` has the names of the classes.
+    """
 
     def __init__(
         self,
@@ -76,7 +84,24 @@ class EstimateReading(Reading):
             order: byte order of the storages, `<` or `>`.
         """
         super().__init__(budget)
+        self.unknown: dict[str, None] = {}
         self.stored, self.from_bytes, self.order = stored, from_bytes, order
+
+    def value(self, node: Any, depth: int) -> Any:
+        if isinstance(node, Name) and node.kind == "unknown":
+            return self.make_unknown(node)
+        return super().value(node, depth)
+
+    def report(self, path: Path) -> None:
+        """Log the names of the classes whose objects were left out."""
+        if self.unknown:
+            names = ", ".join([*self.unknown][:5])
+            log.info("%s: objects of unknown classes were left out, nothing was executed: %s", path.name, names)
+
+    def make_unknown(self, name: Name, *_: Any) -> Unknown:
+        """Return the place of an object that is not created, so that the arrays beside it can be read."""
+        self.unknown[shown(name.path)] = None
+        return Unknown(shown(name.path))
 
     def make_stored(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> NDArray:
         """Return a storage, a flat array, from ('storage', type, key, device, number of values, ...)."""
@@ -155,6 +180,7 @@ class EstimateReading(Reading):
 EstimateReading.makers = {
     **Reading.makers,
     "stored": EstimateReading.make_stored,
+    "unknown": EstimateReading.make_unknown,
     "tensor": EstimateReading.make_tensor,
     "parameter": EstimateReading.make_parameter,
     "storage in bytes": EstimateReading.make_storage_in_bytes,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["Call", "Name", "PickleError", "Raw", "shown", "text_of"]
+__all__ = ["Call", "Name", "PickleError", "Raw", "Unknown", "shown", "text_of"]
 
 
 class PickleError(ValueError):
@@ -63,6 +63,15 @@ class Call:
         self.name, self.args = name, args
         self.state: Any = None
         self.items: dict = {}
+
+
+class Unknown:
+    """The place of an object of an unknown class, which was not created."""
+
+    __slots__ = ("path",)
+
+    def __init__(self, path: str) -> None:
+        self.path = path
 
 
 def text_of(node: Any) -> Any:

@@ -58,22 +58,28 @@ def read_estimate(path: str | Path, what: str = "file") -> Any:
         what: name of the kind of file, for messages.
 
     Returns:
-        As for `read_pickle`; tensors become arrays.
+        As for `read_pickle`; tensors become arrays, and objects of unknown classes `Unknown`, which a log line names.
 
     Raises:
-        UserError: as for `read_pickle`, or the file is too large.
+        UserError: the file is missing, too large, not a pickle, or damaged.
     """
-    return _content(path, what, _MAX_ESTIMATE_BYTES, lambda data: estimate_of(_unpacked(data)))
+    return _content(path, what, _MAX_ESTIMATE_BYTES, lambda data: estimate_of(_unpacked(data), Path(path)))
 
 
-def estimate_of(data: bytes) -> Any:
+def estimate_of(data: bytes, path: Path) -> Any:
     """Return the plain data of a pickle of a video estimator, from its bytes.
+
+    Args:
+        data: bytes of the pickle.
+        path: the file, for the log.
 
     Raises:
         PickleError: it cannot be read; the message is the end of a sentence.
     """
     reading = EstimateReading(_BYTES_ALWAYS + 2 * len(data), from_bytes=storage_of)
-    return reading.value(read_tree(data, ESTIMATE_NAMES), 0)
+    content = reading.value(read_tree(data, ESTIMATE_NAMES), 0)
+    reading.report(path)
+    return content
 
 
 def _unpacked(data: bytes) -> bytes:

@@ -35,11 +35,10 @@ def read_torch(path: str | Path, what: str = "file") -> Any:
 
     Returns:
         dict, list, tuple, set, str, bytes, numbers, None, and a NumPy array per tensor, which owns its memory; bfloat16 becomes
-        float32.
+        float32. Objects of unknown classes become `Unknown`; a log line names the classes.
 
     Raises:
-        UserError: the file is missing, of another format, damaged or too large, or contains a class that plain data does not
-            need; the message names the class.
+        UserError: the file is missing, of another format, damaged or too large.
     """
     path = Path(path)
     if path.is_dir():
@@ -53,11 +52,11 @@ def read_torch(path: str | Path, what: str = "file") -> Any:
             raise UserError(f"{what} {path} is larger than {_MAX_FILE_BYTES >> 20} MiB; save the poses alone")
         with path.open("rb") as file:
             if file.read(len(_OLD)) == _OLD:
-                return _old_content(path.read_bytes())
+                return _old_content(path.read_bytes(), path)
             if not zipfile.is_zipfile(file):
                 raise PickleError("is not a file of PyTorch, or is cut off; copy or download it again")
             with zipfile.ZipFile(file) as archive:
-                return _Archive(archive, path.stat().st_size).content()
+                return _Archive(archive, path.stat().st_size).content(path)
     except UserError:
         raise
     except PickleError as error:
@@ -81,10 +80,10 @@ def storage_of(data: bytes, budget: int) -> Any:
     """
     if not data.startswith(_OLD):
         raise PickleError("has a tensor of an unknown form; it is damaged or made by another program")
-    return _old_content(data, budget)
+    return _old_content(data, None, budget)
 
 
-def _old_content(data: bytes, budget: int | None = None) -> Any:
+def _old_content(data: bytes, path: Path | None, budget: int | None = None) -> Any:
     """Return the content of the old format: system, object and keys as pickles; then per key the number of values, and them."""
     _, at = read_tree_at(data, ESTIMATE_NAMES, len(_OLD))
     tree, at = read_tree_at(data, ESTIMATE_NAMES, at)
@@ -101,7 +100,10 @@ def _old_content(data: bytes, budget: int | None = None) -> Any:
             raise PickleError("has storages that do not fit its tensors; it is damaged or cut off")
         storages[key] = memoryview(data)[begin:at]
     reading = EstimateReading(_budget(len(data)) if budget is None else budget, lambda key: _found(storages, key))
-    return reading.value(tree, 0)
+    content = reading.value(tree, 0)
+    if path is not None:
+        reading.report(path)
+    return content
 
 
 def _value_sizes(tree: Any) -> dict[str, int]:
@@ -120,8 +122,10 @@ def _value_sizes(tree: Any) -> dict[str, int]:
             nodes.extend(node)
         elif isinstance(node, Call) and node.name.kind != "stored":
             nodes.extend((*node.args, node.state, node.items))
-        elif isinstance(node, Call) and isinstance(node.args[0], (list, tuple)) and len(node.args[0]) > 2:
-            sizes[str(text_of(node.args[0][2]))] = value_size(node.args[0][1])
+        elif isinstance(node, Call) and isinstance(node.args[0], tuple) and len(node.args[0]) > 2:
+            what, kind, key = node.args[0][:3]
+            if text_of(what) == "storage":
+                sizes[str(text_of(key))] = value_size(kind)
     return sizes
 
 
@@ -135,7 +139,7 @@ class _Archive:
         self.folder = ""
         self.storages: dict[str, memoryview] = {}
 
-    def content(self) -> Any:
+    def content(self, path: Path) -> Any:
         name = next((name for name in self.members if name.endswith("/data.pkl")), None)
         if name is None:
             raise PickleError("has no data.pkl, as files of torch.save have; give another file")
@@ -143,7 +147,9 @@ class _Archive:
         order = self.member("byteorder") if f"{self.folder}byteorder" in self.members else b"little"
         tree = read_tree(self.member("data.pkl"), ESTIMATE_NAMES)
         reading = EstimateReading(_budget(self.size), self.storage, order=">" if order.strip() == b"big" else "<")
-        return reading.value(tree, 0)
+        content = reading.value(tree, 0)
+        reading.report(path)
+        return content
 
     def storage(self, key: str) -> memoryview:
         if key not in self.storages:

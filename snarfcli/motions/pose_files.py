@@ -84,7 +84,7 @@ def _npz_content(path: Path) -> dict[str, Any]:
 def _unpickler(path: Path) -> Callable[[bytes], Any]:
     def unpickle(data: bytes) -> Any:
         try:
-            return estimate_of(data)
+            return estimate_of(data, path)
         except PickleError as error:
             raise UserError(f"pose file {path} {error}") from None
 

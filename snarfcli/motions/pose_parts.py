@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from snarfcli.bodies import SMPL_JOINT_NAMES
 from snarfcli.errors import UserError
+from snarfcli.formats.pickle_tree import Unknown
 from snarfcli.motions.layouts import BODY_JOINTS, FINGER_JOINTS, LAYOUTS
 
 __all__ = ["lead_axes", "numbers", "poses_of"]
@@ -136,6 +137,8 @@ def numbers(array: Any, name: str, path: Path) -> Array:
     Raises:
         UserError: it is no array, too large, or has something else than finite numbers.
     """
+    if isinstance(array, Unknown):
+        raise UserError(f"pose file {path}: {name}: wanted an array, got an object of {array.path}; nothing was executed")
     if not isinstance(array, np.ndarray):
         raise UserError(f"pose file {path}: {name}: wanted an array, got {type(array).__name__}; repair the file")
     if array.dtype.kind not in "fiu":

@@ -23,6 +23,7 @@ _TURNS_DEG: dict[str, tuple[str, float]] = {
     "y": ("x", 0), "-y": ("x", 180), "z": ("x", -90), "-z": ("x", 90), "x": ("z", 90), "-x": ("z", -90),
 }  # fmt: skip
 _ANKLES, _HEAD = (7, 8), 15
+_NO_MEAN = 0.2  # length of a mean of unit vectors that says nothing
 # A clip is upside down if the head is below the feet in nearly all frames, and by much on average: a handstand among other
 # exercises, a somersault or a cartwheel is not.
 _DOWN_SHARE = 0.95
@@ -30,12 +31,15 @@ _DOWN_MEAN = -0.5
 
 
 def up_axis(root_rotations: Rotation) -> Literal["y", "z"]:
-    """Return the axis along which a body stands on average over T frames.
+    """Return the axis along which a body stands on average over T frames; if it turns over, in the first and last frame.
 
     Args:
         root_rotations: T rotations of the root in the world; the body at rest is upright along y.
     """
-    spine = root_rotations.apply([0.0, 1.0, 0.0]).mean(0)
+    spines = root_rotations.apply([0.0, 1.0, 0.0])
+    spine = spines.mean(0)
+    if np.linalg.norm(spine[1:]) < _NO_MEAN:
+        spine = spines[0] + spines[-1]
     return "z" if abs(spine[2]) > abs(spine[1]) else "y"
 
 

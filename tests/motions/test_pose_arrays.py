@@ -139,7 +139,7 @@ def nan_poses():
         ({"poses": np.zeros((2, 2, 2, 72))}, r"poses: wanted shape \[frames, values\], got \[2, 2, 72\]"),
         ({"poses": np.array("walk")}, "poses: wanted numbers, got <U4"),
         ({"poses": np.array([{"a": 1}], dtype=object)}, "wanted 'poses', got a, poses"),
-        ({"poses": np.array(open, dtype=object)}, "asks for .*open, which plain data does not need; nothing was executed"),
+        ({"poses": np.array(open, dtype=object)}, "poses: wanted an array, got an object of .*open; nothing was executed"),
         ({"poses": np.zeros((4, 72)), "trans": np.zeros((3, 3))}, r"trans: wanted shape \[4, 3\], got \[3, 3\]"),
         ({"poses": np.zeros((4, 72)), "trans": np.zeros(4)}, r"trans: wanted shape \[4, 3\], got \[1, 4\]"),
         ({"poses": np.zeros((1, 72)), "trans": np.full((1, 3), np.nan)}, "trans: wanted finite numbers, got NaN or infinity"),

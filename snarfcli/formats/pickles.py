@@ -24,6 +24,7 @@ _BYTES_ALWAYS = 64 << 20
 # Results of video estimators: WHAM's are the largest, since they have the mesh of every frame, 83 kB each.
 _MAX_ESTIMATE_BYTES = 1 << 28
 _MAX_UNPACKED_BYTES = 3 << 26
+_ESTIMATE_BYTES_ALWAYS = 4 << 20  # small, since one archive may have many such pickles
 _COMPRESSED = (b"\x1f\x8b", b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda")  # gzip, and zlib at each level
 
 
@@ -76,7 +77,7 @@ def estimate_of(data: bytes, path: Path) -> Any:
     Raises:
         PickleError: it cannot be read; the message is the end of a sentence.
     """
-    reading = EstimateReading(_BYTES_ALWAYS + 2 * len(data), from_bytes=storage_of)
+    reading = EstimateReading(_ESTIMATE_BYTES_ALWAYS + 2 * len(data), from_bytes=storage_of)
     content = reading.value(read_tree(data, ESTIMATE_NAMES), 0)
     reading.report(path)
     return content

@@ -23,7 +23,7 @@ _MAX_FILE_BYTES = 1 << 28
 _OLD = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03."
 # Tensors may be views of one storage, so that the result is larger than the file.
 _BYTES_PER_FILE_BYTE = 2
-_BYTES_ALWAYS = 64 << 20
+_BYTES_ALWAYS = 4 << 20
 
 
 def read_torch(path: str | Path, what: str = "file") -> Any:

@@ -16,7 +16,7 @@ from snarfcli.formats.pickle_tree import PickleError
 from snarfcli.formats.pickles import estimate_of, read_estimate
 from snarfcli.formats.torch_files import read_torch
 from snarfcli.motions.pose_keys import CONTAINER_KEYS, FRAME_RATES, listed_keys, role_of
-from snarfcli.motions.pose_sets import PoseSet, find_sets
+from snarfcli.motions.pose_sets import PoseSet, find_sets, without_unread
 
 __all__ = ["POSE_SUFFIXES", "read_pose_sets"]
 
@@ -112,7 +112,7 @@ def _folder_content(path: Path) -> dict[str, Any]:
     files.sort(key=_natural)
     if suffix == ".npz" and {"pose", "poses"} & {*list_npz(files[0], "pose file")}:
         return _joined_frames(files)
-    return {file.name: _content(file) for file in files}
+    return {file.name: without_unread(_content(file)) for file in files}
 
 
 def _joined_frames(files: list[Path]) -> dict[str, NDArray]:

@@ -15,7 +15,7 @@ from snarfcli.errors import UserError, nearest
 from snarfcli.motions.pose_keys import Frame, frame_of, is_of_camera, role_of
 from snarfcli.motions.pose_parts import lead_axes
 
-__all__ = ["Found", "PoseSet", "choose_set", "find_sets"]
+__all__ = ["Found", "PoseSet", "choose_set", "find_sets", "without_unread"]
 
 log = logging.getLogger(__name__)
 
@@ -23,6 +23,7 @@ _MAX_DEPTH = 8
 _MAX_NODES = 200_000
 _MAX_SETS = 100_000
 _MAX_VALUES = 2**24
+_MAX_LISTED = 500_000  # numbers in nested lists; a pickle with more takes too many steps, but may repeat shorter lists
 _PICTURE = re.compile(r".*\.(jpe?g|png|bmp|tiff?|webp|npz|npy|pkl|pickle|pt|pth)", re.IGNORECASE)
 _PERSON_IDS = ("track_ids", "tracked_ids", "tid", "person_ids", "ids")
 _DETECTIONS = ("center_confs", "center_preds")  # ROMP's result of one picture: the first axis is that of the persons
@@ -52,6 +53,20 @@ class PoseSet:
     def has_poses(self) -> bool:
         """Whether there are poses, as a whole or in parts; otherwise there are joints of MHR."""
         return "poses" in self.found or {"root", "body"} <= {*self.found}
+
+
+def without_unread(content: Any, depth: int = 0) -> Any:
+    """Return nested dictionaries and lists without the arrays that are not read, such as vertices; their names stay."""
+
+    def kept(key: Any, value: Any) -> Any:
+        is_read = role_of(key) is not None or key in _PERSON_IDS or isinstance(value, (dict, list, tuple))
+        return without_unread(value, depth + 1) if is_read else None
+
+    if isinstance(content, dict) and depth <= _MAX_DEPTH:
+        return {key: kept(key, value) for key, value in content.items()}
+    if isinstance(content, list) and depth <= _MAX_DEPTH and any(isinstance(item, (dict, list)) for item in content[:1]):
+        return [without_unread(item, depth + 1) for item in content[:_MAX_NODES]]
+    return content
 
 
 def find_sets(content: Any) -> list[PoseSet]:
@@ -254,12 +269,25 @@ def _joined(frames: Mapping[str, list[PoseSet]], pictures: int) -> Iterator[Pose
 
 
 def _plain(value: Any) -> Any:
-    """Return numbers and lists of numbers as an array, and several arrays as a list; any other value unchanged."""
+    """Return numbers and lists of up to 500,000 numbers as an array, and several arrays as a list; others unchanged."""
     if isinstance(value, (np.ndarray, str)):
         return value
     if isinstance(value, (list, tuple)) and len(value) and all(isinstance(item, np.ndarray) for item in value):
         return list(value)
+    if _is_large(value):
+        return value
     try:
         return np.array(value, np.float64)
     except (ValueError, TypeError, OverflowError):
         return value
+
+
+def _is_large(value: Any) -> bool:
+    """Return whether nested lists have too many numbers to become an array."""
+    lists, count = [value], 0
+    while lists and count <= _MAX_LISTED:
+        items = lists.pop()
+        if isinstance(items, (list, tuple)):
+            count += len(items) + 1
+            lists.extend(item for item in items[:_MAX_LISTED] if isinstance(item, (list, tuple)))
+    return count > _MAX_LISTED

@@ -44,10 +44,13 @@ def read_motion(
 
     | file | content |
     |---|---|
-    | `.npz` | AMASS, old and new (SMPL-H, SMPL-X), or plain arrays `poses` or `pose` |
-    | `.npy` | poses, one array |
-    | `.pkl` | AIST++; nothing in it is executed |
-    | folder | one `.npz` per frame with `pose` and optionally `trans` or `transl`, as in CAPE and the papers' demo; 1, 2, 10 |
+    | `.npz`, `.npy`, `.pkl`, `.pt` | arrays of poses in any of these forms; nothing in the files is executed |
+    | AMASS, old and new | `poses` (SMPL-H, SMPL-X), or `root_orient` and `pose_body`; MoSh++, MOYO: `fullpose` |
+    | plain, CAPE, AIST++ | `poses` or `pose`: axis-angle or rotation matrices |
+    | smplx, ROMP, 4D-Humans, GVHMR | `global_orient` and `body_pose`, and fingers and face if present |
+    | WHAM, TRAM, EasyMocap | `pose_world` and `pose`; `pred_rotmat`; `poses` with `Rh` and `Th` |
+    | SAM 3D Body | `pred_global_rots` and `pred_joint_coords`: joints of MHR, retargeted as those of a rig |
+    | folder | one such file per frame: 1, 2, 10 |
     | `.bvh`, `.glb`, `.gltf` | joints of any program, recognised by name |
 
     Args:
@@ -55,14 +58,16 @@ def read_motion(
         skeleton: skeleton of the poses to return; SMPL's 24 joints by default. Arrays are converted between SMPL, SMPL-H and
             SMPL-X joint by joint: hands and face are kept if both have them, else zero. For another kind of skeleton, an array
             has 3 values per joint. Poses of rigs are retargeted by bone directions and the height of the hips.
-        up: up axis of the file. `auto`: for arrays, the array `up` ("y" or "z") if present; else z for AMASS, y for AIST++, y
-            for other arrays without a translation. Otherwise, and for rigs, the axis along which the body stands. A glTF file
-            of the skeleton itself has y up, as the format requires.
+        up: up axis of the file: y, z, x, or their opposites, such as -y for the frame of a camera. `auto`: for arrays, the text
+            `up` if present; else z for AMASS, y for AIST++ and GVHMR, y for other arrays without a translation. Otherwise, and
+            for rigs, the axis y or z along which the body stands. -y if a body hangs head down along y during the whole clip.
+            A glTF file of the skeleton itself has y up, as the format requires.
         hands: pose of SMPL's two hand joints if an array has fingers instead: `rest`, zero; or `released`, values 66 to 72, as
             in the training data of the released code.
-        mapping: for rigs, the joint of the file that moves each joint of the skeleton: {target: source}, or the path of such a
-            JSON file. Other joints are mapped by name; null keeps a joint at rest.
-        clip: for rigs, name or index of the clip; the first by default.
+        mapping: for rigs and MHR, the joint of the file that moves each joint of the skeleton: {target: source}, or the path of
+            such a JSON file. Other joints are mapped by name; null keeps a joint at rest.
+        clip: name or index of the clip of a rig; for arrays, of the person, or of world or camera coordinates. By default the
+            first clip, or the first person in the world.
 
     Returns:
         The motion in a world with y up, facing as in the file, named after the file.

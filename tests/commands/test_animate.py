@@ -307,7 +307,7 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
     [
         ({"surface": "feild"}, "surface: wanted field or skinned, got 'feild'; did you mean 'field'"),
         ({"format": "stl"}, "format: wanted ply or obj, got 'stl'"),
-        ({"up": "x"}, "up: wanted auto, y or z"),
+        ({"up": "w"}, "up: wanted auto, y, z, x, -y, -z or -x"),
         ({"hands": "fists"}, "hands: wanted rest or released, got 'fists'"),
         ({"clip": "walk"}, "clip: wanted a file ending in .bvh, .glb, .gltf, got pose file .*wave.npz; leave it out"),
         ({"resolution": 15}, "resolution: wanted 16 to 1024, got 15"),

@@ -271,6 +271,16 @@ def test_shared_arrays_do_not_grow(tmp_path):
         read_motion(path)
 
 
+def test_lists_that_repeat_others_do_not_grow(tmp_path):
+    numbers = [0.5]
+    for _ in range(20):
+        numbers = [numbers, numbers]
+    path = tmp_path / "a.pkl"
+    path.write_bytes(pickle.dumps({"poses": numbers, "trans": numbers}))
+    with pytest.raises(UserError, match="poses: wanted an array, got list"):
+        read_motion(path)
+
+
 def test_names_and_their_roles():
     assert role_of("poses") == ("poses", "", 0)
     assert role_of("pose_world")[:2] == ("poses", "world")

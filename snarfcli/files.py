@@ -10,7 +10,7 @@ import os
 import re
 import secrets
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +23,7 @@ __all__ = [
     "MAX_ARRAY_BYTES",
     "atomic_path",
     "file_digest",
+    "list_npz",
     "read_json",
     "read_npy",
     "read_npz",
@@ -119,7 +120,12 @@ def read_json(path: str | Path, what: str = "file") -> Any:
 
 
 def read_npz(
-    path: str | Path, what: str = "file", *, only: Collection[str] | None = None, max_bytes: int = MAX_ARRAY_BYTES
+    path: str | Path,
+    what: str = "file",
+    *,
+    only: Collection[str] | None = None,
+    max_bytes: int = MAX_ARRAY_BYTES,
+    objects: Callable[[bytes], Any] | None = None,
 ) -> dict[str, np.ndarray]:
     """Read the arrays of an `.npz` file. Nothing is unpickled; members that are not arrays are left out.
 
@@ -130,6 +136,7 @@ def read_npz(
         what: the kind of file, for messages.
         only: names of the arrays to read, or None for all. Members that are not read are not checked.
         max_bytes: maximum total size of the arrays.
+        objects: returns the content of a pickle without executing it, for arrays of objects; without it, these are rejected.
 
     Raises:
         UserError: the file is missing, cannot be opened, is not a zip archive, is truncated, damaged, encrypted, too large or a
@@ -146,7 +153,8 @@ def read_npz(
                 arrays = {}
                 for name, member in members.items():
                     with archive.open(member) as stream:
-                        array = _read_array(cast(io.BufferedIOBase, stream), member.file_size, f"{what} {path}: {name!r:.60}")
+                        subject = f"{what} {path}: {name!r:.60}"
+                        array = _read_array(cast(io.BufferedIOBase, stream), member.file_size, subject, objects)
                     if array is not None:
                         arrays[name] = array
                 return arrays
@@ -157,8 +165,37 @@ def read_npz(
         raise UserError(f"{what} {path} is damaged ({one_line(reason, 200)}); copy or download it again") from None
 
 
-def read_npy(path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY_BYTES) -> np.ndarray:
+def list_npz(path: str | Path, what: str = "file") -> tuple[str, ...]:
+    """Return the names of the arrays of an `.npz` file, without reading them.
+
+    Raises:
+        UserError: the file is missing, cannot be opened, or is not a zip archive.
+    """
+    path = Path(path)
+    _check_regular(path, what, "an .npz")
+    try:
+        with path.open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise UserError(f"{what} {path} is not an .npz archive, or is truncated; copy or download it again")
+            with zipfile.ZipFile(file) as archive:
+                return tuple(member.filename.removesuffix(".npy") for member in archive.infolist() if not member.is_dir())
+    except UserError:
+        raise
+    except Exception as error:  # zipfile raises many kinds
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise UserError(f"{what} {path} is damaged ({one_line(reason, 200)}); copy or download it again") from None
+
+
+def read_npy(
+    path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY_BYTES, objects: Callable[[bytes], Any] | None = None
+) -> np.ndarray:
     """Read the array of an `.npy` file. Nothing is unpickled; the size is checked first.
+
+    Args:
+        path: file.
+        what: the kind of file, for messages.
+        max_bytes: maximum size of the file.
+        objects: see `read_npz`.
 
     Raises:
         UserError: the file is missing, cannot be opened, is not an `.npy` file, is truncated, too large, or holds pickled
@@ -171,7 +208,7 @@ def read_npy(path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY
         if size > max_bytes:
             raise UserError(f"{what} {path} has {size / 2**20:,.0f} MiB, wanted at most {max_bytes / 2**20:,.0f}; split it")
         with path.open("rb") as file:
-            array = _read_array(file, size, f"{what} {path}")
+            array = _read_array(file, size, f"{what} {path}", objects)
     except OSError as error:
         raise UserError(f"{what} {path} cannot be read ({error.strerror or error})") from None
     if array is None:
@@ -215,7 +252,9 @@ def _members(
     return members
 
 
-def _read_array(stream: io.BufferedIOBase, size: int, subject: str) -> np.ndarray | None:
+def _read_array(
+    stream: io.BufferedIOBase, size: int, subject: str, objects: Callable[[bytes], Any] | None
+) -> np.ndarray | None:
     """Read one array in NumPy's `.npy` format, `size` bytes in total; return None for another format.
 
     NumPy's own reader trusts any length in the header, and evaluates the header as Python.
@@ -241,6 +280,8 @@ def _read_array(stream: io.BufferedIOBase, size: int, subject: str) -> np.ndarra
         dtype = np.dtype(descr)
     except Exception:  # NumPy raises several kinds for a word that is not a type
         raise damaged from None
+    if dtype.hasobject and objects is not None:
+        return _boxed(objects(stream.read(size)))
     if dtype.hasobject:
         raise UserError(f"{subject} holds pickled objects, which are never executed; save plain arrays")
     numbers = [number.rstrip("L") for number in shape.replace(" ", "").split(",") if number]
@@ -264,3 +305,10 @@ def _read_array(stream: io.BufferedIOBase, size: int, subject: str) -> np.ndarra
         return flat.reshape(lengths, order="F" if order == "True" else "C")
     except (ValueError, TypeError):  # such as too many dimensions
         raise damaged from None
+
+
+def _boxed(value: Any) -> np.ndarray:
+    """Return any value as an array of objects without axes."""
+    box = np.empty((), object)
+    box[()] = value
+    return box

@@ -6,8 +6,10 @@ To add a reader, add a function with `@_target` anywhere below: its name is what
 from __future__ import annotations
 
 import random
+import zlib
 from collections.abc import Callable
 
+import numpy as np
 from fuzzing import Target
 
 __all__ = ["TARGETS"]
@@ -24,8 +26,6 @@ def _target(make: Callable[[], Target]) -> Callable[[], Target]:
 @_target
 def npz() -> Target:
     import io
-
-    import numpy as np
 
     from snarfcli.files import read_npz
 
@@ -178,7 +178,6 @@ def pickle() -> Target:
     import pickle
     from pathlib import Path
 
-    import numpy as np
     import scipy.sparse
     from pickle_damage import damaged
 
@@ -219,7 +218,6 @@ def body_npz() -> Target:
     """Bodies in SMPL's format, as archives."""
     import io
 
-    import numpy as np
     from pickle_damage import damaged_arrays
     from smpl_files import octahedron, toy
 
@@ -337,7 +335,6 @@ def surface_gltf() -> Target:
 
 
 def _poses(frames: int, width: int):
-    import numpy as np
 
     return np.linspace(-0.5, 0.5, frames * width, dtype=np.float32).reshape(frames, width)
 
@@ -346,16 +343,15 @@ def _poses(frames: int, width: int):
 def motion_npz() -> Target:
     import io
 
-    import numpy as np
-
     from snarfcli.motions import read_motion
 
     def seeds() -> list[bytes]:
         old = {"poses": _poses(2, 156), "trans": np.zeros((2, 3)), "mocap_framerate": 120.0, "gender": b"male"}
         parts = {"root_orient": _poses(3, 3), "pose_body": _poses(3, 63), "pose_hand": _poses(3, 90), "mocap_frame_rate": 60}
+        smplx = {"global_orient": _poses(2, 3), "body_pose": _poses(2, 69), "left_hand_pose": _poses(2, 45)}
         matrices = {"poses": np.tile(np.eye(3, dtype=np.float32), (1, 24, 1, 1)), "transl": np.ones((1, 3), "f4")}
         made = []
-        for arrays in (old, parts, matrices, {"pose": _poses(1, 72)[0]}):
+        for arrays in (old, parts, smplx, matrices, {"pose": _poses(1, 72)[0]}):
             buffer = io.BytesIO()
             (np.savez_compressed if arrays is parts else np.savez)(buffer, **arrays)
             made.append(buffer.getvalue())
@@ -367,8 +363,6 @@ def motion_npz() -> Target:
 def _odd_npz(rng: random.Random, content: bytes) -> bytes:
     """Return another archive: the arrays of the seed with wrong shapes, types and values."""
     import io
-
-    import numpy as np
 
     np.seterr(all="ignore")
     with np.load(io.BytesIO(content)) as archive:
@@ -395,7 +389,10 @@ def _odd_npz(rng: random.Random, content: bytes) -> bytes:
         elif kind == 6:
             array = np.zeros(rng.choice([(), (0,), (0, 72), (72, 0), (1, 1, 1, 1), (24, 3), (2, 52, 3), (1, 66), (3, 0, 3, 3)]))
         else:
-            other = rng.choice(["poses", "pose", "trans", "smpl_scaling", "fps", "root_orient", "pose_body", "smpl_poses"])
+            other = rng.choice(
+                ["poses", "pose", "trans", "smpl_scaling", "fps", "root_orient", "pose_body", "smpl_poses", "body_pose", "up",
+                 "global_orient", "pose_world", "left_hand_pose", "Rh", "Th", "pred_cam_t", "results", "pred_global_rots"]
+            )  # fmt: skip
             arrays[other] = array
             continue
         arrays[key] = array
@@ -407,8 +404,6 @@ def _odd_npz(rng: random.Random, content: bytes) -> bytes:
 @_target
 def motion_pkl() -> Target:
     import pickle
-
-    import numpy as np
 
     from snarfcli.motions import read_motion
 
@@ -425,7 +420,6 @@ def motion_bvh() -> Target:
     import tempfile
     from pathlib import Path
 
-    import numpy as np
     from toy_rigs import CMU_NAMES, MIXAMO_NAMES, a_pose, rig_of, write_bvh
 
     from snarfcli.motions import read_motion
@@ -438,3 +432,110 @@ def motion_bvh() -> Target:
             return [write_bvh(Path(folder) / "seed.bvh", rig).read_bytes() for rig in rigs]
 
     return Target("motion_bvh", ".bvh", seeds, read_motion)
+
+
+@_target
+def motion_pt() -> Target:
+    """Results of video estimators as `torch.save` writes them, in both formats."""
+    import torch
+    from estimates import gvhmr, saved
+
+    from snarfcli.motions import read_motion
+
+    def seeds() -> list[bytes]:
+        poses = _poses(2, 72).reshape(2, 24, 3).astype(np.float64)
+        results = gvhmr(poses, np.ones((2, 3)))
+        small = {"poses": torch.from_numpy(poses).half(), "fps": torch.tensor(30).bfloat16(), "notes": ["a", (1, 2.5, None)]}
+        return [saved(results), saved(results, is_zip=False), saved(small), saved(small, is_zip=False)]
+
+    return Target("motion_pt", ".pt", seeds, read_motion, _odd_pt)
+
+
+def _odd_pt(rng: random.Random, content: bytes) -> bytes:
+    """Return a file of PyTorch whose pickle or storages are damaged; its archive stays valid."""
+    import zipfile
+
+    from estimates import rezipped
+    from fuzz_damage import DAMAGES
+    from pickle_damage import damaged
+
+    if content[:2] != b"PK":
+        return damaged(rng, content)
+    chosen = rng.choice(["data.pkl", "data.pkl", "data.pkl", "data/", "byteorder"])
+
+    def change(name: str, data: bytes) -> bytes | None:
+        if chosen not in name:
+            return data
+        if chosen == "data.pkl":
+            return damaged(rng, data)
+        return rng.choice([None, b"", data[: len(data) // 2], data * 3, rng.choice(DAMAGES)(rng, data, b"big")])
+
+    try:
+        return rezipped(content, change)
+    except zipfile.BadZipFile:
+        return content
+
+
+@_target
+def motion_estimate() -> Target:
+    """Results of video estimators as pickles, with what joblib and PyTorch write."""
+    import pickle
+
+    import torch
+    from estimates import wham
+    from pickle_damage import damaged
+
+    from snarfcli.motions import read_motion
+
+    def seeds() -> list[bytes]:
+        poses = _poses(2, 72).reshape(2, 24, 3).astype(np.float64)
+        person = wham(poses, np.ones((2, 3)))
+        tensors = {key: torch.from_numpy(value).float() for key, value in person.items()}
+        pictures = {f"{number}.jpg": {"tid": [1], "smpl": [{"pose": poses[number].ravel()}]} for number in range(2)}
+        plain = [pickle.dumps(content, protocol) for content in ({0: person, 1: tensors}, pictures) for protocol in (2, 4)]
+        return [*plain, _like_joblib(poses.reshape(2, 72)), zlib.compress(_like_joblib(poses.reshape(2, 72)))]
+
+    return Target("motion_estimate", ".pkl", seeds, read_motion, damaged)
+
+
+def _like_joblib(array: np.ndarray) -> bytes:
+    """Return {0: {"poses": array}} in a defaultdict as joblib writes it: the array's bytes follow its description."""
+    import pickle
+
+    state = {"shape": array.shape, "order": "C", "dtype": array.dtype, "allow_mmap": True, "numpy_array_alignment_bytes": 16}
+    wrapper = b"cjoblib.numpy_pickle\nNumpyArrayWrapper\n)\x81" + pickle.dumps(state, 2)[2:-1] + b"b"
+    padded = b"\x05" + b"\xff" * 5 + array.tobytes()
+    head = b"\x80\x02ccollections\ndefaultdict\nc__builtin__\ndict\n\x85RK\x00}X\x05\x00\x00\x00poses"
+    return head + wrapper + padded + b"ss."
+
+
+@_target
+def motion_mhr() -> Target:
+    """Joints of MHR, as SAM 3D Body writes them."""
+    import io
+
+    from estimates import mhr_person
+
+    from snarfcli.motions import read_motion
+
+    def seeds() -> list[bytes]:
+        made = []
+        for person in ({key: value[0] for key, value in mhr_person().items()}, mhr_person(frames=3)):
+            for content in (person, {"results": np.array([person], object)}):
+                buffer = io.BytesIO()
+                np.savez(buffer, **content)
+                made.append(buffer.getvalue())
+        return made
+
+    return Target("motion_mhr", ".npz", seeds, read_motion, _odd_mhr)
+
+
+def _odd_mhr(rng: random.Random, content: bytes) -> bytes:
+    """Return another archive: its arrays, or the pickle in one, are damaged."""
+
+    from estimates import rezipped
+    from pickle_damage import damaged
+
+    if b"results.npy" not in content:
+        return _odd_npz(rng, content)
+    return rezipped(content, lambda _, data: data[:128] + damaged(rng, data[128:]))

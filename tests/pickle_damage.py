@@ -21,7 +21,8 @@ _PIECES = (
     b"c_codecs\nencode\n", b"ccopy_reg\n_reconstructor\n", b"cnumpy.core.multiarray\nscalar\n", b"h\x00", b"h\x01", b"h\x05",
     b"(t", b"(l", b"(d", b"}b", b")R", b")\x81", b"Nb", b"2\x86", b"r\xff\xff\xff\xff", b"\x8e" + b"\xff" * 8, b"K\x01K\x02s",
     b"]" * 100, b"\x85" * 100, b"2a", b"h\x00a", b"U\x02f8", b"U\x02O8", b"U\x03U99", b"I99999999999\n", b"Vx\\ud800\n", b"N",
-    b"0",
+    b"0", b"ctorch._utils\n_rebuild_tensor_v2\n", b"ctorch\nBFloat16Storage\n", b"ctorch.storage\n_load_from_bytes\n", b"Q",
+    b"cjoblib.numpy_pickle\nNumpyArrayWrapper\n", b"ccollections\ndefaultdict\n", b"c__builtin__\ndict\n",
 )  # fmt: skip
 
 

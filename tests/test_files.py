@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from snarfcli.errors import UserError
-from snarfcli.files import atomic_path, read_json, read_npy, read_npz, write_json, write_tensors
+from snarfcli.files import atomic_path, list_npz, read_json, read_npy, read_npz, write_json, write_tensors
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
@@ -147,6 +147,19 @@ def test_archives_that_are_strange_end_in_one_line(tmp_path: Path) -> None:
     large = packed(tmp_path / "large.npz", ("x.npy", npy(np.random.default_rng(0).normal(size=2000))))
     with pytest.raises(UserError, match="unpacks to 0 MiB, wanted at most 0; split it"):
         read_npz(large, max_bytes=16000)
+
+
+def test_objects_are_left_to_a_function_that_executes_nothing(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", x=np.array([{}], dtype=object), y=np.arange(2))
+    assert list_npz(tmp_path / "a.npz") == ("x", "y")
+    arrays = read_npz(tmp_path / "a.npz", objects=lambda data: ("seen", data[:1]))
+    assert arrays["x"].item() == ("seen", b"\x80")
+    assert arrays["y"].tolist() == [0, 1]
+    np.save(tmp_path / "a.npy", np.array([{}], dtype=object))
+    assert read_npy(tmp_path / "a.npy", objects=len).item() > 100
+    (tmp_path / "text.npz").write_text("no zip")
+    with pytest.raises(UserError, match=r"text.npz is not an .npz archive"):
+        list_npz(tmp_path / "text.npz")
 
 
 def test_what_is_not_asked_for_may_hold_anything(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ class MotionSelection:
     """Settings that say how a motion is read, and which frames of it are used."""
 
     up: str = MISSING
-    """Up axis of the pose file: auto, y or z."""
+    """Up axis of the pose file: auto, y, z, x, or -y (the frame of a camera), -z, -x."""
     hands: str = MISSING
     """SMPL's hand joints if the pose file has fingers: rest (straight), or released (as in the papers' code)."""
     rest: str = MISSING
@@ -74,7 +74,7 @@ class MotionSelection:
     mapping: str | None = MISSING
     """For .bvh and .glb: JSON file {joint of the avatar: joint of the pose file}; null matches common joint names."""
     clip: str | None = MISSING
-    """For .bvh and .glb: name or number of the animation; null for the first."""
+    """Name or number of the animation (.bvh, .glb), or of the person in a video's results; null for the first."""
     motion_seed: int = MISSING
     """Seed of the built-in motion; each seed gives another variant."""
     motion_frame_rate: float = MISSING

@@ -34,6 +34,6 @@ class DataConfig:
     scale: str = "auto"
     """Metres per unit of the files, for meshes; auto: 1 for a subject of a person's size, else what gives it that size."""
     up: str = "auto"
-    """Up axis of the files, for amass and meshes: auto, y or z."""
+    """Up axis of the files: auto, y or z, for amass and meshes; also x, -x, -y or -z, for amass."""
     canonical: str = "auto"
     """Canonical pose, for meshes: rest; legs_apart (SNARF's, if rest is a T-pose); auto (from the skeleton file, else rest)."""

@@ -25,7 +25,7 @@ from snarfcli.export.clips import Clip, clip_transforms
 from snarfcli.export.export import check_output
 from snarfcli.motions import Motion
 from snarfcli.motions.joint_names import find_body_parts
-from snarfcli.motions.up_axis import y_from_z_up
+from snarfcli.motions.up_axis import y_from_up
 from snarfcli.names import unique_names
 
 __all__ = ["BVH_ORDERS", "UNITS", "BvhOptions", "BvhReport", "bvh_motion", "export_bvh"]
@@ -180,7 +180,7 @@ def _turn(options: BvhOptions) -> NDArray[np.float64]:
     """Return the rotation [3, 3] of the world from the axes of the skeleton to those of the file."""
     if options.up == options.skeleton_up:
         return np.eye(3)
-    turn = np.rint(y_from_z_up().as_matrix())
+    turn = np.rint(y_from_up("z").as_matrix())
     return turn if options.up == "y" else turn.T
 
 

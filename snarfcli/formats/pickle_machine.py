@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import codecs
+import math
 import struct
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from snarfcli.formats.pickle_numbers import checked_shape, dtype_of
 from snarfcli.formats.pickle_tree import Call, Name, PickleError, Raw, shown
 
 __all__ = ["PickleMachine", "plain_key"]
 
 _NUMBER_LENGTH = 100  # bytes of a number
+# What is accepted besides names: objects outside the file, and any other name.
+_STORED, _UNKNOWN = ("", "stored"), ("", "unknown")
 
 
 class PickleMachine:
@@ -20,10 +24,10 @@ class PickleMachine:
     Every method raises `PickleError` for a damaged pickle or one that asks for more than plain data.
     """
 
-    def __init__(self, data: bytes, known: Mapping[tuple[str, str], str]) -> None:
+    def __init__(self, data: bytes, known: Mapping[tuple[str, str], str], start: int = 0) -> None:
         self.data, self.known = data, known
         self.view = memoryview(data)
-        self.at = 0
+        self.at = start
         self.stack: list[Any] = []
         self.marks: list[int] = []
         self.memo: dict[int, Any] = {}
@@ -117,7 +121,7 @@ class PickleMachine:
     def push_name(self, module: str | bytes, name: str | bytes) -> None:
         # A name that is not ASCII is never a known one.
         module, name = (str(part, "ascii", "replace") if isinstance(part, bytes) else part for part in (module, name))
-        kind = self.known.get((module, name))
+        kind = self.known.get((module, name), self.known.get(_UNKNOWN))
         if kind is None:
             raise PickleError(f"asks for {shown(module)}.{shown(name)}, which plain data does not need; nothing was executed")
         self.stack.append(Name(f"{module}.{name}", kind))
@@ -130,6 +134,8 @@ class PickleMachine:
 
     def push_call(self) -> None:
         args, name = self.pop(), self.pop()
+        if isinstance(name, Call) and name.name.kind in ("unknown", "stored"):  # such as the class of a model of PyTorch
+            name = Name(name.name.path, "unknown")
         if not isinstance(name, Name) or not isinstance(args, tuple):
             raise self.damaged()
         self.stack.append(Call(name, args))
@@ -144,6 +150,22 @@ class PickleMachine:
         if not isinstance(call, Call) or call.state is not None:
             raise self.damaged()
         call.state = state
+        if call.name.kind == "array in file":
+            call.args = (self.take_array(state),)
+
+    def take_array(self, state: Any) -> Raw:
+        """Take the bytes of an array that joblib writes into the pickle, behind the description of the array."""
+        if not isinstance(state, dict):
+            raise self.damaged()
+        size = math.prod(checked_shape(state.get("shape"))) * dtype_of(state.get("dtype")).itemsize
+        if state.get("numpy_array_alignment_bytes") is not None:
+            self.take(self.unpack("<B"))
+        return Raw(self.take(size), None)
+
+    def push_stored(self, key: Any) -> None:
+        if _STORED not in self.known:
+            raise PickleError("refers to an object outside the file, which plain data does not need")
+        self.stack.append(Call(Name("stored", "stored"), (key,)))
 
     def put(self, index: int) -> None:
         self.memo[index] = self.peek()
@@ -167,6 +189,8 @@ class PickleMachine:
 
     def append(self, values: list) -> None:
         target = self.peek()
+        if isinstance(target, Call) and target.name.kind == "unknown":
+            return
         if type(target) is not list:
             raise self.damaged()
         target.extend(values)
@@ -179,6 +203,8 @@ class PickleMachine:
 
     def set_items(self, values: list) -> None:
         target = self.peek()
+        if isinstance(target, Call) and target.name.kind == "unknown":
+            return
         if isinstance(target, Call):
             target = target.items
         if type(target) is not dict:

@@ -11,16 +11,16 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from snarfcli.formats.pickle_tree import PickleError, shown
+from snarfcli.formats.pickle_tree import Call, PickleError, shown, text_of
 
-__all__ = ["SPARSE_FORMS", "checked_shape", "make_array", "make_dtype", "make_sparse", "select"]
+__all__ = ["SPARSE_FORMS", "checked_shape", "dtype_of", "make_array", "make_sparse", "select"]
 
 SPARSE_FORMS = {"csc": scipy.sparse.csc_matrix, "csr": scipy.sparse.csr_matrix, "coo": scipy.sparse.coo_matrix}
 # Numbers and text. `O8` is the type of objects in Python 2.
 _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,6}|O[48]?)")
 
 
-def make_dtype(code: Any, order: Any) -> np.dtype:
+def _make_dtype(code: Any, order: Any) -> np.dtype:
     """Return the type of an array from its code, for example `f8`, and its byte order."""
     match = _DTYPE.fullmatch(code) if isinstance(code, str) else None
     if match is None:
@@ -30,6 +30,22 @@ def make_dtype(code: Any, order: Any) -> np.dtype:
     if order not in ("<", ">", "|", "="):
         raise PickleError("has an array without a byte order; it is damaged")
     return np.dtype(object if match[1][0] == "O" else order + match[1])
+
+
+def dtype_of(node: Any) -> np.dtype:
+    """Return the type of an array from the node of NumPy's type object.
+
+    Raises:
+        PickleError: it is no type of numbers or text.
+    """
+    if not isinstance(node, Call) or node.name.kind != "dtype" or not node.args:
+        raise PickleError("has an array without a type; it is damaged")
+    order = None
+    if node.state is not None:  # (version, byte order, base of a subarray, names, fields, ...)
+        if not isinstance(node.state, tuple) or len(node.state) < 5 or any(part is not None for part in node.state[2:5]):
+            raise PickleError("array type: wanted numbers or text, got records")
+        order = text_of(node.state[1])
+    return _make_dtype(text_of(node.args[0]), order)
 
 
 def checked_shape(shape: Any) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ from typing import Any
 from snarfcli.formats.pickle_machine import PickleMachine, plain_key
 from snarfcli.formats.pickle_tree import PickleError
 
-__all__ = ["read_tree"]
+__all__ = ["read_tree", "read_tree_at"]
 
 # A body or a motion takes some hundred steps, a long list of numbers one step per number. Half a million take about a second.
 _MAX_STEPS = 500_000
@@ -21,25 +21,36 @@ _STOP = 0x2E
 
 
 def read_tree(data: bytes, known: Mapping[tuple[str, str], str]) -> Any:
+    """Return the content of a pickle that begins at the first byte; see `read_tree_at`."""
+    return read_tree_at(data, known, 0)[0]
+
+
+def read_tree_at(data: bytes, known: Mapping[tuple[str, str], str], start: int) -> tuple[Any, int]:
     """Return the content of a pickle as None, bool, int, float, str, list, tuple, dict, set, `Raw`, `Name` and `Call`.
 
     Containers may be shared and may contain themselves, as in the pickle. Keys and members of sets are plain values.
 
     Args:
         data: bytes of the file.
-        known: kind of each accepted (module, name), which becomes `Name.kind`; other names raise.
+        known: kind of each accepted (module, name), which becomes `Name.kind`; other names raise. With ("", "stored"),
+            references to objects outside the pickle become a `Call` of that kind; with ("", "unknown"), other names are
+            accepted and have that kind.
+        start: first byte of the pickle.
+
+    Returns:
+        The content, and the number of the byte after the pickle.
 
     Raises:
         PickleError: a name is not known, the pickle is damaged, or it asks for more than plain data.
     """
-    machine, end = PickleMachine(data, known), len(data)
+    machine, end = PickleMachine(data, known, start), len(data)
     for _ in range(_MAX_STEPS):
         if machine.at >= end:
             raise machine.damaged()
         code = data[machine.at]
         machine.at += 1
         if code == _STOP:
-            return machine.pop()
+            return machine.pop(), machine.at
         operation = _OPERATIONS.get(code)
         if operation is None:
             raise machine.damaged()
@@ -59,7 +70,6 @@ def _rejected(what: str) -> Callable[[PickleMachine], None]:
 
 
 _EXTENSION = _rejected("a class by a registered number")
-_PERSISTENT = _rejected("an object outside the file")
 _BUFFER = _rejected("a buffer outside the file")
 
 _OPERATIONS: dict[int, Callable[[PickleMachine], Any]] = {
@@ -128,8 +138,8 @@ _OPERATIONS: dict[int, Callable[[PickleMachine], Any]] = {
         "b": PickleMachine.build,
         "i": PickleMachine.reject_instance,
         "o": _rejected("an old-style class"),
-        "P": _PERSISTENT,
-        "Q": _PERSISTENT,
+        "P": lambda m: m.push_stored(m.line(100)),
+        "Q": lambda m: m.push_stored(m.pop()),
         0x82: _EXTENSION,
         0x83: _EXTENSION,
         0x84: _EXTENSION,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["Call", "Name", "PickleError", "Raw", "shown"]
+__all__ = ["Call", "Name", "PickleError", "Raw", "Unknown", "shown", "text_of"]
 
 
 class PickleError(ValueError):
@@ -63,3 +63,17 @@ class Call:
         self.name, self.args = name, args
         self.state: Any = None
         self.items: dict = {}
+
+
+class Unknown:
+    """The place of an object of an unknown class, which was not created."""
+
+    __slots__ = ("path",)
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+
+def text_of(node: Any) -> Any:
+    """Return the text or bytes of a node inside the file; any other node unchanged."""
+    return node.value if isinstance(node, Raw) else node

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from snarfcli.formats.pickle_numbers import SPARSE_FORMS, checked_shape, make_array, make_dtype, make_sparse, select
-from snarfcli.formats.pickle_tree import Call, Name, PickleError, Raw, shown
+from snarfcli.formats.pickle_numbers import SPARSE_FORMS, checked_shape, dtype_of, make_array, make_sparse, select
+from snarfcli.formats.pickle_tree import Call, Name, PickleError, Raw, shown, text_of
 
-__all__ = ["KNOWN_NAMES", "plain_data"]
+__all__ = ["KNOWN_NAMES", "Reading", "odd", "plain_data"]
 
 _MAX_DEPTH = 64
 _MAX_VALUES = 10_000_000
@@ -57,11 +57,14 @@ def plain_data(tree: Any, budget: int) -> Any:
     Raises:
         PickleError: the tree is damaged, too large, or contains itself.
     """
-    return _Reading(budget).value(tree, 0)
+    return Reading(budget).value(tree, 0)
 
 
-class _Reading:
+class Reading:
     """Conversion of a pickle's tree to plain data, with counters that keep a small file from becoming large."""
+
+    makers: ClassVar[dict[str, Callable[..., Any]]] = {}
+    """The method per kind of object."""
 
     def __init__(self, budget: int) -> None:
         self.budget = budget
@@ -118,42 +121,42 @@ class _Reading:
         name, args, state = call.name, call.args, call.state
         if name.kind == "object of":  # protocols 0 and 1: (class, object, None) creates an empty instance
             if len(args) != 3 or not isinstance(args[0], Name) or _kind(args[1]) != "object" or args[2] is not None:
-                raise _odd(name)
+                raise odd(name)
             name, args = args[0], ()
-        if call.items and name.kind != "dict":
-            raise _odd(name)
-        make = _MAKERS.get(name.kind)
+        if call.items and name.kind not in ("dict", "default dict"):
+            raise odd(name)
+        make = self.makers.get(name.kind)
         if make is None:
-            raise _odd(name)
+            raise odd(name)
         return make(self, name, args, state, call, depth)
 
     # One method per kind of object.
 
     def make_array(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
         if len(args) != 3 or _kind(args[0]) != "array type" or not isinstance(state, tuple) or len(state) not in (4, 5):
-            raise _odd(name)
+            raise odd(name)
         shape, dtype, is_fortran, data = state[-4:]
         return self.array(name, shape, dtype, "F" if is_fortran is True or is_fortran == 1 else "C", data, depth)
 
     def make_array_from_bytes(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
         if len(args) != 4 or state is not None:
-            raise _odd(name)
+            raise odd(name)
         data, dtype, shape, order = args
         order = self.value(order, depth)
         if order not in ("C", "F", None):
-            raise _odd(name)
+            raise odd(name)
         return self.array(name, shape, dtype, order or "C", data, depth)
 
     def make_scalar(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
         if len(args) != 2 or state is not None:
-            raise _odd(name)
+            raise odd(name)
         value = self.array(name, (), args[0], "C", args[1], depth)
         if not isinstance(value, np.ndarray):
-            raise _odd(name)
+            raise odd(name)
         return value.item()
 
     def array(self, name: Name, shape: Any, dtype: Any, order: Literal["C", "F"], data: Any, depth: int) -> NDArray | list:
-        shape, dtype = checked_shape(shape), self.dtype(dtype)
+        shape, dtype = checked_shape(shape), dtype_of(dtype)
         if dtype.kind == "O":
             if not isinstance(data, list) or len(data) != math.prod(shape):
                 raise PickleError(f"has an array of shape {shown(list(shape))} and another number of objects; it is damaged")
@@ -162,16 +165,6 @@ class _Reading:
         self.spend(len(view))
         return make_array(shape, dtype, order, view)
 
-    def dtype(self, node: Any) -> np.dtype:
-        if _kind(node) != "dtype" or not isinstance(node, Call) or not node.args:
-            raise PickleError("has an array without a type; it is damaged")
-        order = None
-        if node.state is not None:  # (version, byte order, base of a subarray, names, fields, ...)
-            if not isinstance(node.state, tuple) or len(node.state) < 5 or any(part is not None for part in node.state[2:5]):
-                raise PickleError("array type: wanted numbers or text, got records")
-            order = _text(node.state[1])
-        return make_dtype(_text(node.args[0]), order)
-
     def bytes(self, name: Name, node: Any, depth: int) -> memoryview:
         if isinstance(node, Raw) and node.encoding != "utf-8":
             return node.view
@@ -179,7 +172,7 @@ class _Reading:
         if isinstance(value, str):
             value = self.encoded(value)
         if not isinstance(value, bytes):
-            raise _odd(name)
+            raise odd(name)
         return memoryview(value)
 
     def encoded(self, text: str) -> bytes:
@@ -190,48 +183,48 @@ class _Reading:
             raise PickleError("has text in place of bytes; it is damaged") from None
 
     def make_bytes_from_text(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> bytes:
-        if len(args) != 2 or state is not None or _text(args[1]) not in ("latin1", "latin-1"):
-            raise _odd(name)
+        if len(args) != 2 or state is not None or text_of(args[1]) not in ("latin1", "latin-1"):
+            raise odd(name)
         text = args[0].decoded() if isinstance(args[0], Raw) else args[0]  # not kept, since it may be most of the file
         if not isinstance(text, str):
-            raise _odd(name)
+            raise odd(name)
         return self.encoded(text)
 
     def make_bytes(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> bytes:
         if args or state is not None:
-            raise _odd(name)
+            raise odd(name)
         return b""
 
     def make_set(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> set:
         values = self.value(args[0], depth) if len(args) == 1 else () if not args else None
         if not isinstance(values, (list, tuple)) or state is not None:
-            raise _odd(name)
+            raise odd(name)
         return self.keyed(name, [(value, None) for value in values]).keys() | set()
 
     def make_dict(self, name: Name, args: tuple, state: Any, call: Call, depth: int) -> dict:
         pairs = self.value(args[0], depth) if len(args) == 1 else [] if not args else None
         if not isinstance(pairs, list) or state or any(not isinstance(pair, (list, tuple)) or len(pair) != 2 for pair in pairs):
-            raise _odd(name)
+            raise odd(name)
         return {**self.keyed(name, pairs), **{key: self.value(item, depth) for key, item in call.items.items()}}
 
     def keyed(self, name: Name, pairs: list) -> dict:
         if any(key is not None and not isinstance(key, (str, int, float, bytes)) for key, _ in pairs):
-            raise _odd(name)
+            raise odd(name)
         return dict(pairs)
 
     def make_chumpy_value(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
         if not isinstance(state, dict) or "x" not in state:
-            raise _odd(name)
+            raise odd(name)
         value = self.value(state["x"], depth)
         if isinstance(value, (bool, int, float)):
             return np.array(value)
         if not isinstance(value, np.ndarray) and not scipy.sparse.issparse(value):
-            raise _odd(name)
+            raise odd(name)
         return value
 
     def make_chumpy_selection(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> NDArray:
         if not isinstance(state, dict):
-            raise _odd(name)
+            raise odd(name)
         source, chosen, shape = (self.value(state.get(key), depth) for key in ("a", "idxs", "preferred_shape"))
         if isinstance(source, np.ndarray) and isinstance(chosen, np.ndarray):
             self.spend(chosen.size * (source.itemsize + 8) + (0 if source.flags.c_contiguous else source.nbytes))
@@ -239,7 +232,7 @@ class _Reading:
 
     def make_sparse(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
         if not isinstance(state, dict):
-            raise _odd(name)
+            raise odd(name)
         keys = ("row", "col") if name.kind == "coo" else ("indices", "indptr")
         shape, data, coords, *index = (self.value(state.get(key), depth) for key in ("_shape", "data", "coords", *keys))
         index = coords if name.kind == "coo" and isinstance(coords, tuple) else index
@@ -253,23 +246,20 @@ def _kind(node: Any) -> str | None:
     return node.kind if isinstance(node, Name) else None
 
 
-def _text(node: Any) -> Any:
-    return node.value if isinstance(node, Raw) else node
-
-
-def _odd(name: Name) -> PickleError:
+def odd(name: Name) -> PickleError:
+    """Return the error for an object whose parts are not those that its class has."""
     return PickleError(f"has a {shown(name.path)} of an unknown form; it is damaged or made by another program")
 
 
-_MAKERS: dict[str, Callable[..., Any]] = {
-    "array": _Reading.make_array,
-    "array from bytes": _Reading.make_array_from_bytes,
-    "scalar": _Reading.make_scalar,
-    "chumpy value": _Reading.make_chumpy_value,
-    "chumpy selection": _Reading.make_chumpy_selection,
-    **dict.fromkeys(SPARSE_FORMS, _Reading.make_sparse),
-    "bytes from text": _Reading.make_bytes_from_text,
-    "bytes": _Reading.make_bytes,
-    "set": _Reading.make_set,
-    "dict": _Reading.make_dict,
+Reading.makers = {
+    "array": Reading.make_array,
+    "array from bytes": Reading.make_array_from_bytes,
+    "scalar": Reading.make_scalar,
+    "chumpy value": Reading.make_chumpy_value,
+    "chumpy selection": Reading.make_chumpy_selection,
+    **dict.fromkeys(SPARSE_FORMS, Reading.make_sparse),
+    "bytes from text": Reading.make_bytes_from_text,
+    "bytes": Reading.make_bytes,
+    "set": Reading.make_set,
+    "dict": Reading.make_dict,
 }

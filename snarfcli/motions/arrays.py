@@ -1,10 +1,10 @@
-"""Interpret the arrays of a pose file: poses in any layout, translation, frame rate."""
+"""Make a motion of a set of pose arrays: poses in any layout, translation, frame rate, up axis."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,149 +13,149 @@ from scipy.spatial.transform import Rotation
 from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError
 from snarfcli.motions.angles import angle_problem
-from snarfcli.motions.layouts import BODY_JOINTS, FINGER_JOINTS, LAYOUTS, carry_over, layout_of
+from snarfcli.motions.layouts import BODY_JOINTS, LAYOUTS, carry_over, layout_of
 from snarfcli.motions.motion import Motion
-from snarfcli.motions.up_axis import Up, up_axis, y_up_from_z_up
+from snarfcli.motions.pose_parts import numbers, poses_of
+from snarfcli.motions.pose_sets import PoseSet
+from snarfcli.motions.positions import are_positions
+from snarfcli.motions.up_axis import UPS, Up, hangs_head_down, up_axis, upright
 
-__all__ = ["DEFAULT_FRAME_RATE", "MAX_POSE_BYTES", "POSE_KEYS", "motion_from_arrays"]
+__all__ = ["DEFAULT_FRAME_RATE", "VIDEO_FRAME_RATE", "frame_rate_of", "motion_from_arrays", "place_of"]
 
 log = logging.getLogger(__name__)
 
+Array = NDArray[np.float64]
+
 DEFAULT_FRAME_RATE = 60.0
 """Frames per second of files without a frame rate: that of DFaust, CAPE and AIST++."""
-MAX_POSE_BYTES = 2**28
-"""Maximum size of the arrays of a pose file, as stored."""
-_MAX_VALUES = 2**24  # 35 minutes of SMPL-H at 50 frames per second
-_POSES = ("poses", "pose", "smpl_poses")
-_TRANSLATIONS = ("trans", "transl", "translation", "smpl_trans")
-_FRAME_RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "fps")
-# AMASS's SMPL-X files have these beside `poses`; files cut from them may have only these. pose_hand: left, then right.
-_PARTS = {
-    "root_orient": BODY_JOINTS[:1],
-    "pose_body": BODY_JOINTS[1:],
-    "pose_hand": FINGER_JOINTS,
-    "pose_jaw": ("jaw",),
-    "pose_eye": ("l_eye", "r_eye"),
-}
-POSE_KEYS = (*_POSES, *_TRANSLATIONS, "smpl_scaling", *_FRAME_RATES, *_PARTS, "up", "gender")
-"""Names of all arrays that are read; gender is not used, but pickled objects in its place are rejected."""
+VIDEO_FRAME_RATE = 30.0
+"""The same for results of video estimators, whose frames are those of the video."""
 _MAX_DISTANCE_M = 1e6
+_MAX_POSITIONS = 1000  # joints
 
 
-def motion_from_arrays(
-    arrays: Mapping[str, NDArray], skeleton: Skeleton, path: Path, *, name: str, up: Up, hands: str
-) -> Motion:
-    """Return the motion that the arrays of a pose file describe.
+def motion_from_arrays(arrays: PoseSet, skeleton: Skeleton, path: Path, *, name: str, up: Up, hands: str) -> Motion:
+    """Return the motion that a set of pose arrays describes.
 
     Args:
-        arrays: `poses` as [T, 3 K], [T, K, 3] or rotation matrices [T, K, 3, 3], or AMASS's parts `root_orient`, `pose_body`
-            etc. Optional, under their usual names: a translation; `smpl_scaling`, by which it is divided; a frame rate; `up`,
-            the text y or z.
+        arrays: poses as [T, 3 K], [T, K, 3] or rotation matrices [T, K, 3, 3], or root, body and further parts. Optional: a
+            translation; a divisor of it; a frame rate; the up axis as text.
         skeleton: skeleton of the poses to return.
         path: the file, for messages.
         name: name of the motion.
-        up: up axis of the file; `auto` uses `up` of the file if present.
+        up: up axis of the file; `auto` uses that of the file if present.
         hands: pose of SMPL's hand joints if the file has fingers: `rest` or `released`.
 
     Raises:
-        UserError: an array is missing, has a wrong shape or number of values, is not finite, or is in degrees.
+        UserError: an array is missing, has a wrong shape or number of values, is not finite, is in degrees, or has positions
+            of joints.
     """
-    values, names, is_amass = _values(arrays, path, _wanted(skeleton))
+    values, names = poses_of(arrays.found, path, _wanted(skeleton))
     frames = len(values)
     if frames == 0:
         raise UserError(f"pose file {path}: wanted at least 1 frame, got 0; give another file")
+    _check_rotations(values, arrays, path)
     poses = _of_skeleton(values, names, skeleton, path, hands)
     _check_angles(poses, path)
-    key = next((key for key in _TRANSLATIONS if key in arrays), None)
-    translation = np.zeros((frames, 3))
-    if key is not None:
-        translation = np.atleast_2d(_numbers(arrays[key], key, path))
-        if translation.shape != (frames, 3):
-            raise UserError(
-                f"pose file {path}: {key}: wanted shape [{frames}, 3], got {list(translation.shape)}; repair the file"
-            )
-        translation = translation / _scaling(arrays, path)
-        if np.abs(translation).max() > _MAX_DISTANCE_M:
-            limit = f"at most {_MAX_DISTANCE_M / 1000:g} km"
-            raise UserError(f"pose file {path}: {key}: wanted metres, {limit}, got more; repair the file")
-    frame_rate = _frame_rate(arrays, path)
+    translation = place_of(arrays, frames, path)
+    has_place = translation is not None
+    translation = np.zeros((frames, 3)) if translation is None else translation
+    root_rest = skeleton.joints_rest[0].detach().cpu().double().numpy()
+    if "placed_rotation" in arrays.found and "placed_translation" in arrays.found:
+        poses, translation = _placed(poses, arrays, root_rest, path)
+        has_place = True
     if up == "auto":
-        up = _declared_up(arrays)
-        if up == "auto" and is_amass and layout_of(skeleton) is not None:
-            up = "z"
-        elif up == "auto" and "smpl_poses" in arrays:  # AIST++ has y up, also where dancers lie on the floor
-            up = "y"
-        elif up == "auto":
-            up = "y" if key is None else up_axis(Rotation.from_rotvec(poses[:, 0]))
-        if up == "z":
-            log.info("%s: z is up in this file and was turned to y", path.name)
-    if up == "z":
-        root_rest = skeleton.joints_rest[0].detach().cpu().double().numpy()
-        poses, translation = y_up_from_z_up(poses, translation, root_rest)
-    return Motion(name, poses, translation, frame_rate)
+        up = _guessed_up(arrays, poses, skeleton, has_place, path)
+    poses, translation = upright(poses, translation, root_rest, up)
+    return Motion(name, poses, translation, frame_rate_of(arrays, path))
 
 
-def _declared_up(arrays: Mapping[str, NDArray]) -> Up:
+def place_of(arrays: PoseSet, frames: int, path: Path) -> Array | None:
+    """Return the translation [T, 3] of a set of pose arrays, metres; None if there is none.
+
+    Raises:
+        UserError: it has another shape, is not finite, or is no place on earth.
+    """
+    if "trans" not in arrays.found:
+        return None
+    key, array = arrays.found["trans"]
+    translation = np.atleast_2d(numbers(array, key, path))
+    if translation.ndim > 2 and translation.size == 3 * frames:
+        translation = translation.reshape(frames, 3)
+    if translation.shape != (frames, 3):
+        shape = list(translation.shape)
+        raise UserError(f"pose file {path}: {key}: wanted shape [{frames}, 3], got {shape}; repair the file")
+    translation = translation / _scaling(arrays, path)
+    if np.abs(translation).max() > _MAX_DISTANCE_M:
+        limit = f"at most {_MAX_DISTANCE_M / 1000:g} km"
+        raise UserError(f"pose file {path}: {key}: wanted metres, {limit}, got more; repair the file")
+    return translation
+
+
+def frame_rate_of(arrays: PoseSet, path: Path) -> float:
+    """Return the frames per second of a set of pose arrays, or the usual number if the file has none."""
+    if "frame_rate" in arrays.found:
+        key, value = arrays.found["frame_rate"]
+        return _positive(value, key, path)
+    usual = VIDEO_FRAME_RATE if arrays.frame or arrays.is_video else DEFAULT_FRAME_RATE
+    log.info("%s: no frame rate given, %g frames per second assumed", path.name, usual)
+    return usual
+
+
+def _guessed_up(arrays: PoseSet, poses: Array, skeleton: Skeleton, has_place: bool, path: Path) -> Up:
+    """Return the up axis that the file declares, that of its kind of file, or that along which the body stands."""
+    up = _declared_up(arrays)
+    if up == "auto" and layout_of(skeleton) is not None and _is_amass(arrays):
+        up = "z"
+    elif up == "auto" and _has_y_up(arrays):
+        up = "y"
+    elif up == "auto":
+        up = up_axis(Rotation.from_rotvec(poses[:, 0])) if has_place and arrays.frame != "camera" else "y"
+        if up == "y" and layout_of(skeleton) is not None and hangs_head_down(poses, is_likely=arrays.frame == "camera"):
+            log.info("%s: the body hangs head down along y, so that y was taken to point down; up=y keeps it", path.name)
+            return "-y"
+    if up != "y":
+        log.info("%s: %s is up in this file and was turned to y", path.name, up)
+    return up
+
+
+def _declared_up(arrays: PoseSet) -> Up:
     """Return the up axis that the file declares; `auto` if it does not."""
-    declared = str(arrays.get("up", ""))
-    return "y" if declared == "y" else "z" if declared == "z" else "auto"
+    value = arrays.found.get("up", ("", ""))[1]
+    word = str(value.ravel()[0] if isinstance(value, np.ndarray) and value.size else value)
+    return cast(Up, word) if word in UPS else "auto"
 
 
-def _values(arrays: Mapping[str, NDArray], path: Path, wanted: str) -> tuple[NDArray[np.float64], tuple[str, ...], bool]:
-    """Return the poses [T, K, 3], the names of the K joints (empty if unknown), and whether the file is from AMASS."""
-    key = next((key for key in _POSES if key in arrays), None)
-    if key is None:
-        return _from_parts(arrays, path), (*BODY_JOINTS, *FINGER_JOINTS, "jaw", "l_eye", "r_eye"), True
-    values = _numbers(arrays[key], key, path)
-    if values.ndim == 4 and values.shape[2:] == (3, 3):
-        return _from_matrices(values, key, path), (), False
-    if values.ndim == 2 and values.shape[1] == 3 and values.shape[0] in LAYOUTS:
-        values = values[None]  # one pose, joint by joint
-    if values.ndim == 3 and values.shape[2] == 3:
-        values = values.reshape(len(values), 3 * values.shape[1])
-    if values.ndim == 1 and len(values):
-        values = values[None]
-    if values.ndim != 2:
-        raise UserError(f"pose file {path}: {key}: wanted shape [frames, values], got {list(values.shape)}; repair the file")
-    if values.shape[1] % 3 or not values.shape[1]:
-        raise UserError(f"pose file {path}: wanted {wanted} values per frame, got {values.shape[1]}; give another file")
-    poses = values.reshape(len(values), values.shape[1] // 3, 3)
-    return poses, (), values.shape[1] in (156, 165)
+def _has_y_up(arrays: PoseSet) -> bool:
+    """Return whether files of this kind have y up, also where the body lies on the floor: AIST++ and GVHMR."""
+    return arrays.found.get("poses", ("",))[0] == "smpl_poses" or "smpl_params_global" in arrays.label
 
 
-def _from_matrices(matrices: NDArray[np.float64], key: str, path: Path) -> NDArray[np.float64]:
-    flat = matrices.reshape(-1, 3, 3)
-    error = np.abs(flat @ flat.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
-    if error > 1e-3 or (np.linalg.det(flat) < 0).any():
-        shape = list(matrices.shape)
-        raise UserError(f"pose file {path}: {key}: wanted rotation matrices, got others of shape {shape}; repair the file")
-    turns = Rotation.from_matrix(flat).as_rotvec() if len(flat) else np.zeros((0, 3))
-    return turns.reshape(*matrices.shape[:2], 3)
+def _is_amass(arrays: PoseSet) -> bool:
+    """Return whether the arrays are in AMASS's form: 156 or 165 values, or its parts."""
+    if arrays.frame:
+        return False
+    if "poses" not in arrays.found:
+        return arrays.found["body"][0] == "pose_body"
+    shape = arrays.found["poses"][1].shape
+    width = 3 * shape[-2] if len(shape) == 3 and shape[-1] == 3 else shape[-1] if len(shape) < 3 else 0
+    return width in (156, 165)
 
 
-def _from_parts(arrays: Mapping[str, NDArray], path: Path) -> NDArray[np.float64]:
-    """Return the poses [T, 55, 3] of body, fingers and face from AMASS's parts; missing parts are zero."""
-    missing = [key for key in ("root_orient", "pose_body") if key not in arrays]
-    if missing:
-        found = ", ".join(sorted(arrays)) or "no pose arrays"
-        raise UserError(f"pose file {path}: wanted 'poses', got {found}; give an AMASS-style file")
-    frames = np.atleast_2d(arrays["root_orient"]).shape[0]
-    parts = []
-    for key, joints in _PARTS.items():
-        values = np.zeros((frames, 3 * len(joints)))
-        if key in arrays:
-            values = np.atleast_2d(_numbers(arrays[key], key, path))
-            if values.size != frames * 3 * len(joints):
-                shape = list(arrays[key].shape)
-                wanted = [frames, 3 * len(joints)]
-                raise UserError(f"pose file {path}: {key}: wanted shape {wanted}, got {shape}; repair the file")
-        parts.append(values.reshape(frames, -1, 3) if frames else np.zeros((0, len(joints), 3)))
-    return np.concatenate(parts, 1)
+def _placed(poses: Array, arrays: PoseSet, root_rest: Array, path: Path) -> tuple[Array, Array]:
+    """Return poses and translation of a posed body that is then rotated about the origin and moved, as in EasyMocap."""
+    (key, rotations), (other, places) = arrays.found["placed_rotation"], arrays.found["placed_translation"]
+    turns, way = numbers(rotations, key, path), numbers(places, other, path)
+    if turns.size != 3 * len(poses) or way.size != 3 * len(poses):
+        got = f"{list(turns.shape)} and {list(way.shape)}"
+        raise UserError(f"pose file {path}: {key}, {other}: wanted shape [{len(poses)}, 3], got {got}; repair the file")
+    rotation = Rotation.from_rotvec(turns.reshape(-1, 3))
+    poses = poses.copy()
+    poses[:, 0] = (rotation * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
+    return poses, rotation.apply(root_rest) + way.reshape(-1, 3) - root_rest
 
 
-def _of_skeleton(
-    values: NDArray[np.float64], names: tuple[str, ...], skeleton: Skeleton, path: Path, hands: str
-) -> NDArray[np.float64]:
+def _of_skeleton(values: Array, names: tuple[str, ...], skeleton: Skeleton, path: Path, hands: str) -> Array:
     """Return the poses [T, J, 3] of the skeleton's joints."""
     wanted = layout_of(skeleton)
     if not names:
@@ -175,41 +175,29 @@ def _wanted(skeleton: Skeleton) -> str:
     return "72 (SMPL), 156 (SMPL-H) or 165 (SMPL-X)"
 
 
-def _check_angles(poses: NDArray[np.float64], path: Path) -> None:
+def _check_rotations(values: Array, arrays: PoseSet, path: Path) -> None:
+    """Raise UserError if the values are positions of joints."""
+    if "poses" in arrays.found and values.shape[1] <= _MAX_POSITIONS and are_positions(values):
+        key = arrays.found["poses"][0]
+        raise UserError(
+            f"pose file {path}: {key}: wanted rotations, got joint positions: their distances stay those of a body's bones;"
+            " give the file with the rotations, or fit SMPL to the positions first"
+        )
+
+
+def _check_angles(poses: Array, path: Path) -> None:
     problem = angle_problem(poses)
     if problem:
         raise UserError(f"pose file {path}: {problem}")
 
 
-def _numbers(array: NDArray, name: str, path: Path) -> NDArray[np.float64]:
-    if array.dtype.kind not in "fiu":
-        raise UserError(f"pose file {path}: {name}: wanted numbers, got {array.dtype}; repair the file")
-    if array.size > _MAX_VALUES:
-        raise UserError(f"pose file {path}: {name}: wanted at most {_MAX_VALUES} values, got {array.size}; cut it into parts")
-    with np.errstate(over="ignore"):
-        values = array.astype(np.float64)
-    broken = ~np.isfinite(values)
-    if broken.any():
-        frame = int(np.argwhere(broken)[0][0]) if array.ndim > 1 else 0
-        wanted = "wanted finite numbers, got NaN or infinity"
-        raise UserError(f"pose file {path}: {name}: {wanted}, first in frame {frame}; repair or cut the file")
-    return values
-
-
-def _positive(array: NDArray, key: str, path: Path) -> float:
-    if array.dtype.kind not in "fiu" or array.size != 1 or not np.isfinite(array).all() or not 1e-6 < array.item() < 1e6:
+def _positive(array: object, key: str, path: Path) -> float:
+    values = np.asarray(array)
+    if values.dtype.kind not in "fiu" or values.size != 1 or not np.isfinite(values).all() or not 1e-6 < values.item() < 1e6:
         raise UserError(f"pose file {path}: {key}: wanted one positive number, got other values; repair the file")
-    return float(array.item())
+    return float(values.item())
 
 
-def _scaling(arrays: Mapping[str, NDArray], path: Path) -> float:
+def _scaling(arrays: PoseSet, path: Path) -> float:
     """Return the divisor of AIST++'s translation; 1 for other files."""
-    return _positive(arrays["smpl_scaling"], "smpl_scaling", path) if "smpl_scaling" in arrays else 1.0
-
-
-def _frame_rate(arrays: Mapping[str, NDArray], path: Path) -> float:
-    key = next((key for key in _FRAME_RATES if key in arrays), None)
-    if key is None:
-        log.info("%s: no frame rate given, %g frames per second assumed", path.name, DEFAULT_FRAME_RATE)
-        return DEFAULT_FRAME_RATE
-    return _positive(arrays[key], key, path)
+    return _positive(arrays.found["scaling"][1], arrays.found["scaling"][0], path) if "scaling" in arrays.found else 1.0

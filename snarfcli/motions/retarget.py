@@ -30,7 +30,7 @@ from snarfcli.motions.motion import Motion
 from snarfcli.motions.rest_match import RestMatch
 from snarfcli.motions.rest_poses import rest_turns
 from snarfcli.motions.rig_rest import resting_in, straightened, turned
-from snarfcli.motions.up_axis import Up, up_axis, y_from_z_up
+from snarfcli.motions.up_axis import Up, up_axis, y_from_up
 
 __all__ = ["Retargeted", "choose_clip", "retarget", "retarget_rig"]
 
@@ -149,7 +149,7 @@ def retarget_rig(
     axis = _up(Rotation.from_matrix(moved[0] @ turns[0]), turns[0]) if up == "auto" else up
     if up == "auto" and axis == "z":
         log.info("%s: z is up in this file and was turned to y", path.name)
-    upright = y_from_z_up().as_matrix() if axis == "z" else np.eye(3)
+    upright = np.eye(3) if axis == "y" else y_from_up(axis).as_matrix()
 
     rotations = {joint: upright @ moved[joint] @ turns[joint] for joint in pairs}
     poses = _local_poses(rotations, skeleton.parents, len(clip.world_from_joint))

@@ -308,9 +308,12 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
     [
         ({"surface": "feild"}, "surface: wanted field or skinned, got 'feild'; did you mean 'field'"),
         ({"format": "stl"}, "format: wanted ply or obj, got 'stl'"),
-        ({"up": "x"}, "up: wanted auto, y or z"),
+        ({"up": "w"}, "up: wanted auto, y, z, x, -y, -z or -x"),
         ({"hands": "fists"}, "hands: wanted rest or released, got 'fists'"),
-        ({"clip": "walk"}, "clip: wanted a file ending in .bvh, .glb, .gltf, got pose file .*wave.npz; leave it out"),
+        (
+            {"clip": "walk"},
+            "clip: wanted a file ending in .bvh, .glb, .gltf, got pose file .*wave.npz with one motion; leave it out",
+        ),
         ({"resolution": 15}, "resolution: wanted 16 to 1024, got 15"),
         ({"keep_share": 1.5}, "keep_share: wanted 0 to 1, got 1.5"),
         ({"step": 0}, "step: wanted at least 1"),

@@ -96,7 +96,7 @@ def test_what_cannot_be_used_is_rejected(skeleton, walk):
         ({"frame_rate": 0.0}, "frame_rate: wanted 1.0 to 1000.0, got 0.0"),
         ({"frame_rate": float("nan")}, "frame_rate: wanted 1.0 to 1000.0, got nan"),
         ({"step": 0}, "step: wanted at least 1, got 0"),
-        ({"up": "x"}, "up: wanted auto, y or z, got .x."),
+        ({"up": "w"}, "up: wanted auto, y, z, x, -y, -z or -x, got .w."),
     ):
         with pytest.raises(UserError, match=message):
             check_motion_selection(replace(PLAIN, **changes))

@@ -209,8 +209,8 @@ def test_what_is_missing_is_named(few: Path, tmp_path: Path) -> None:
         subjects(tmp_path / "empty", tmp_path)
     with pytest.raises(UserError, match=r"no subject '50002' in .*clips; wanted one of clips"):
         load(few, "50002")
-    with pytest.raises(UserError, match=r"data.up: wanted auto, y or z, got 'x'"):
-        load(few, up="x")
+    with pytest.raises(UserError, match=r"data.up: wanted auto, y, z, x, -y, -z or -x, got 'w'"):
+        load(few, up="w")
     with pytest.raises(UserError, match=r"data.hands: wanted rest or released, got 'fist'"):
         load(few, hands="fist")
     for name in ("jog", "walk"):

@@ -36,8 +36,8 @@ def test_bad_files(tmp_path):
 
 
 def test_wrong_arguments(tmp_path):
-    with pytest.raises(ValueError, match="up: wanted 'auto', 'y' or 'z', got 'x'"):
-        read_motion(tmp_path / "a.npz", up="x")
+    with pytest.raises(ValueError, match="up: wanted one of auto, y, z, x, -y, -z, -x, got 'w'"):
+        read_motion(tmp_path / "a.npz", up="w")
     with pytest.raises(ValueError, match="hands: wanted 'rest' or 'released', got 'fists'"):
         read_motion(tmp_path / "a.npz", hands="fists")
     with pytest.raises(UserError, match=r"wanted 6 values per frame, got 72"):
@@ -108,7 +108,8 @@ def test_folders_that_are_no_frames(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ([1, 2], "wanted a dict with smpl_poses, as in AIST.., got list"),
+        ([1, 2], "wanted 'poses', got no named arrays; give a file with poses"),
+        ("dance", "wanted 'poses', got no named arrays"),
         ({"smpl_trans": np.zeros((2, 3))}, "wanted 'poses', got smpl_trans"),
         ({"smpl_poses": "dance"}, "smpl_poses: wanted an array, got str"),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -29,6 +30,11 @@ _FINGER_JOINT_NAMES = tuple(
 SMPLH_JOINT_NAMES = (*SMPL_JOINT_NAMES[:22], *_FINGER_JOINT_NAMES)
 SMPLX_JOINT_NAMES = (*SMPL_JOINT_NAMES[:22], "jaw", "l_eye", "r_eye", *_FINGER_JOINT_NAMES)
 
+_SIDES = {"l": "r", "L": "R", "left": "right", "Left": "Right", "LEFT": "RIGHT"}
+_SIDES |= {right: left for left, right in _SIDES.items()}
+# A word of its own, a letter before a capital, or left and right in a word: l_hip, hip.L, Ear_R_tip, lThigh, LeftArm, hand_left
+_SIDE = re.compile("^[lr](?=[A-Z])|(?<![A-Za-z])[lLrR](?![A-Za-z])|left|right|Left|Right|LEFT|RIGHT")
+
 CANONICAL_HIP_RAD = torch.pi / 6
 """Outward rotation of each leg in the canonical pose (SNARF's released code: 30 degrees)."""
 
@@ -45,12 +51,17 @@ def legs_apart_pose(names: tuple[str, ...], dtype: torch.dtype = torch.float32) 
     return pose
 
 
+def _other_side(name: str) -> str:
+    """Return the name of the joint on the other side; the same name if it names no side."""
+    return _SIDE.sub(lambda match: _SIDES[match[0]], name, count=1)
+
+
 @dataclass(frozen=True, eq=False)
 class Skeleton:
     """A joint tree with its rest joints and its canonical pose."""
 
     names: tuple[str, ...]
-    """J joint names; those of the left and right side start with `l_` and `r_`."""
+    """J joint names; those of the two sides differ in `l` and `r`, or `left` and `right`, as a word: `l_hip`, `Ear_R`."""
     parents: tuple[int, ...]
     """J parents, -1 for the root; a parent comes before its children."""
     joints_rest: Tensor
@@ -78,10 +89,9 @@ class Skeleton:
 
     @property
     def left_right(self) -> tuple[int, ...]:
-        """Per joint, the index of its counterpart on the other side; its own index if there is none."""
-        other = {"l": "r_", "r": "l_"}
-        mirrored = (other[name[0]] + name[2:] if name[:2] in ("l_", "r_") else name for name in self.names)
-        return tuple(self.names.index(m) if m in self.names else j for j, m in enumerate(mirrored))
+        """Per joint, the index of its counterpart on the other side by its name; its own index if there is none."""
+        numbers = {name: joint for joint, name in enumerate(self.names)}
+        return tuple(numbers.get(_other_side(name), joint) for joint, name in enumerate(self.names))
 
     @property
     def canonical_joints(self) -> Tensor:

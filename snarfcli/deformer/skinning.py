@@ -7,7 +7,7 @@ from torch import Tensor
 
 from snarfcli.deformer.blending import blend
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
-from snarfcli.networks import run_encoding
+from snarfcli.networks import MAX_FEATURES, run_encoding
 from snarfcli.precision import matmul_precision
 
 __all__ = ["blend_transforms", "forward_jacobian", "interpolate", "skin"]
@@ -68,8 +68,10 @@ def interpolate(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:
         inside = points.clamp(grid.lower + _INSIDE * size, grid.upper - _INSIDE * size)
         rows = torch.arange(depth * height * width, dtype=torch.int32)
         box = [*grid.lower.tolist(), *size.tolist()]
-        table = values.reshape(-1, values.shape[-1])
-        return run_encoding(inside, points.new_empty(0), table, rows, [width, height, depth], box)[:, 3:]
+        none = points.new_empty(0)
+        tables = values.reshape(-1, values.shape[-1]).split(MAX_FEATURES, dim=1)
+        parts = [run_encoding(inside, none, table, rows, [width, height, depth], box)[:, 3:] for table in tables]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
     cell, local = locate(points, grid, shape)
     corners = cell_corners(cell, shape)
     phi = trilinear_weights(local.clamp(0, 1))

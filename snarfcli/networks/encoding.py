@@ -14,7 +14,10 @@ from torch import Tensor
 from snarfcli.native import cpu_networks
 from snarfcli.native.backend import choose_backend
 
-__all__ = ["encode", "encode_reference", "run_encoding"]
+__all__ = ["MAX_FEATURES", "encode", "encode_reference", "run_encoding"]
+
+MAX_FEATURES = 64
+"""Maximum number of features per node that the native operator takes (csrc/cpu/network_task.h)."""
 
 
 def encode_reference(
@@ -60,6 +63,7 @@ def run_encoding(
     table = points.new_empty(0, 1) if table is None else table
     rows = torch.empty(0, dtype=torch.int32, device=points.device) if rows is None else rows
     is_native = points.device.type == "cpu" and points.dtype == table.dtype == torch.float32
+    is_native &= table.shape[1] <= MAX_FEATURES
     run = encode if is_native and choose_backend("auto") == "native" else encode_reference
     return run(points, frequencies, table, rows, list(nodes), list(boxes))
 

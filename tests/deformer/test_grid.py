@@ -15,6 +15,18 @@ from snarfcli.deformer.skinning import forward_jacobian, interpolate
 SHAPE = (3, 4, 6)
 
 
+@pytest.mark.parametrize("channels", [3, 64, 65, 150])
+def test_native_interpolation_takes_any_number_of_channels(channels):
+    """A dragon has more bones than a person."""
+    generator = torch.Generator().manual_seed(channels)
+    values = torch.rand(4, 5, 6, channels, generator=generator)
+    points = torch.rand(50, 3, generator=generator) * 2 - 1
+    with torch.no_grad():
+        native = interpolate(values, points, unit_grid(torch.float32))
+    reference = interpolate(values.double(), points.double(), unit_grid())
+    torch.testing.assert_close(native, reference.float(), atol=1e-5, rtol=1e-5)
+
+
 def test_corners_of_a_cell_are_its_nodes():
     grid = unit_grid()
     nodes = grid.nodes(SHAPE).reshape(-1, 3)

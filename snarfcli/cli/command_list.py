@@ -86,9 +86,9 @@ COMMAND_LIST = (
         "doctor",
         "doctor",
         "DoctorConfig",
-        "check the installation or a data set: versions, native parts, reasons for fallbacks",
-        "snarf doctor",
-        {},
+        "check the installation, a data set or a motion file: versions, reasons for fallbacks, what was read",
+        "snarf doctor --pose walk.bvh",
+        {"--pose": "pose={}"},
     ),
     Command(
         "reproduce",

@@ -44,11 +44,23 @@ class DoctorConfig:
     data: DataConfig | None = None
     """Data set to check, instead of the installation."""
     subject: str | None = None
-    """Subject of the data set to check; all for every subject, null for the first three."""
+    """Subject of the data set to check; all for every subject, null for the first three. With `pose`: whose body is used."""
     body: str | None = None
     """Body model file, or a folder with it; null searches below data_root."""
     figure: str | None = None
-    """File for the picture of the data; null for <output_root>/doctor/<data>_<subject>.png."""
+    """File for the picture; null for <data>_<subject>.png, or that of the motion file, in <output_root>/doctor."""
+    pose: str | None = None
+    """Motion file to check: how it is read, and what it looks like on a body (the built-in one, or that of a data set)."""
+    up: str = "auto"
+    """Up axis of the motion file: auto, y, z, x, -y, -z or -x."""
+    hands: str = "rest"
+    """SMPL's hand joints if the motion file has fingers instead: rest or released."""
+    rest: str = "auto"
+    """For rigs: rest pose to compare with the body's: auto, file, clip (all frames), or the number of a frame."""
+    mapping: str | None = None
+    """For rigs: JSON file {joint of the body: joint of the file}; null matches common joint names."""
+    clip: str | None = None
+    """Name or number of the animation or person in the motion file; null for the first."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +79,8 @@ def run(config: DoctorConfig) -> int:
     Returns:
         0, also if fallbacks are in use; 2 if the data set to check cannot be used.
     """
+    if config.pose is not None:
+        return _check_pose(config, config.pose)
     if config.data is not None:
         return _check_data(config, config.data)
     sections: dict[str, Callable[[], Iterator[Finding]]] = {
@@ -85,6 +99,23 @@ def run(config: DoctorConfig) -> int:
                 fallbacks.append(finding.name)
     log.info("")
     log.info("%s", f"fallbacks or missing parts: {', '.join(fallbacks)} (see above)" if fallbacks else "nothing is missing")
+    return 0
+
+
+def _check_pose(config: DoctorConfig, pose: str) -> int:
+    """Report how a motion file is read, and draw it; 2 if it cannot be used."""
+    from snarfcli.checks import check_choice
+    from snarfcli.commands.doctor_pose import PoseQuestion, check_pose
+    from snarfcli.datasets.sources import Request
+    from snarfcli.motions.layouts import HANDS
+    from snarfcli.motions.up_axis import UPS
+
+    check_choice("up", config.up, UPS)
+    check_choice("hands", config.hands, HANDS)
+    request = None if config.data is None else Request(config.data, Path(config.data_root), config.body)
+    question = PoseQuestion(pose, config.up, config.hands, config.rest, config.mapping, config.clip, request, config.subject)
+    name = Path(pose).stem
+    check_pose(question, Path(config.figure or Path(config.output_root) / "doctor" / f"{name}.png"))
     return 0
 
 

@@ -51,6 +51,8 @@ class Retargeted:
     """The motion of the skeleton."""
     source: Array
     """[T, K, 3], places of the rig's joints in the world of the motion, metres."""
+    source_names: tuple[str, ...]
+    """K names of the rig's joints."""
     source_parents: tuple[int, ...]
     """K parents, -1 for a root."""
     pairs: dict[int, int]
@@ -158,7 +160,7 @@ def retarget_rig(
     translation = _translation(match, source, rotations[0])
     if not np.abs(translation).max() < _MAX_DISTANCE_M:
         raise UserError(f"{path}: the body moves over {_MAX_DISTANCE_M / 1000:g} km away; check the track of its root")
-    return Retargeted(Motion(name, poses, translation, clip.frame_rate), source, rig.parents, pairs)
+    return Retargeted(Motion(name, poses, translation, clip.frame_rate), source, rig.names, rig.parents, pairs)
 
 
 def _turns(match: RestMatch, moved: Mapping[int, Array], posed: Array, rest: str, path: Path) -> dict[int, Array]:

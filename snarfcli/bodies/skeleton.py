@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -68,6 +68,8 @@ class Skeleton:
     """[J, 3], joint positions in the rest pose, metres."""
     canonical_pose: Tensor
     """[J, 3], pose of the canonical frame relative to the rest pose, axis-angle, radians."""
+    idle: tuple[int, ...] = ()
+    """Joints that move no part of the subject, such as a root on the floor: they only place other joints."""
 
     def __post_init__(self) -> None:
         joints = len(self.parents)
@@ -76,6 +78,8 @@ class Skeleton:
                 raise ValueError(f"{name}: wanted shape [{joints}, 3], got {list(getattr(self, name).shape)}")
         if len(self.names) != joints:
             raise ValueError(f"names: wanted {joints} names, one per parent, got {len(self.names)}")
+        if not all(0 <= joint < joints for joint in self.idle) or len(self.idle) >= joints > 0:
+            raise ValueError(f"idle: wanted some joints from 0 to {joints - 1}, but not all, got {list(self.idle)}")
 
     @property
     def num_joints(self) -> int:
@@ -117,7 +121,8 @@ class Skeleton:
 
     def to(self, *args: Any, **kwargs: Any) -> Skeleton:
         """Convert both tensors as `Tensor.to` does."""
-        return Skeleton(self.names, self.parents, self.joints_rest.to(*args, **kwargs), self.canonical_pose.to(*args, **kwargs))
+        joints_rest, pose = self.joints_rest.to(*args, **kwargs), self.canonical_pose.to(*args, **kwargs)
+        return replace(self, joints_rest=joints_rest, canonical_pose=pose)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content as plain lists and tensors, which `torch.load(weights_only=True)` accepts."""
@@ -126,7 +131,7 @@ class Skeleton:
             "parents": list(self.parents),
             "joints_rest": self.joints_rest.detach().cpu(),
             "canonical_pose": self.canonical_pose.detach().cpu(),
-        }
+        } | ({"idle": list(self.idle)} if self.idle else {})
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Skeleton:
@@ -136,4 +141,5 @@ class Skeleton:
             parents=tuple(int(parent) for parent in content["parents"]),
             joints_rest=torch.as_tensor(content["joints_rest"]),
             canonical_pose=torch.as_tensor(content["canonical_pose"]),
+            idle=tuple(int(joint) for joint in content.get("idle", ())),  # files of before have none
         )

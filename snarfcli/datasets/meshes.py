@@ -209,6 +209,9 @@ def _load_rigged(subject: str, place: Path, paths: list[Path], config: DataConfi
     if rigged.dropped:
         some = ", ".join(rigged.dropped[:4]) + (", ..." if len(rigged.dropped) > 4 else "")
         sources.append(f"{len(rigged.dropped)} end joints that move no vertex were left out ({some})")
+    if skeleton.idle:
+        some = ", ".join(skeleton.names[joint] for joint in skeleton.idle[:4]) + (", ..." if len(skeleton.idle) > 4 else "")
+        sources.append(f"joints that only place others, and move no vertex, get no weights and no shape: {some}")
     sources.append(_conversion_text(why, up))
     template = partial(_template, vertices, mesh.faces, mesh.weights)
     left_out = tuple(f"motion {name} was left out: {reason}" for name, reason in rigged.left_out)
@@ -274,7 +277,7 @@ def _world_skeleton(file: SkeletonFile, world: FileToWorld, canonical: str) -> S
         pose = legs_apart_pose(file.names, torch.float64)
     elif canonical == "auto" and file.canonical_pose is not None:
         pose = torch.from_numpy(world.angles(file.canonical_pose))
-    return Skeleton(file.names, file.parents, rest, pose)
+    return Skeleton(file.names, file.parents, rest, pose, file.idle)
 
 
 def _conversion_text(why: str, up: str) -> str:

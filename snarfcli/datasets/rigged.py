@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +75,8 @@ def read_rigged_files(paths: Sequence[Path]) -> RiggedFiles:
                 left_out.append((name, f"joint {joint!r:.60} has scale 0 in frame {hidden[0]}, so a part of the mesh vanishes"))
     dropped = tuple(name for joint, name in enumerate(first.names) if joint not in set(kept.tolist()))
     mesh = RigMesh(whole.vertices, whole.faces, whole.weights[:, kept])
-    return RiggedFiles(_skeleton(first, kept), mesh, tuple(clips), dropped, tuple(left_out))
+    idle = tuple(np.flatnonzero(~np.any(mesh.weights > 0, axis=0)).tolist())
+    return RiggedFiles(replace(_skeleton(first, kept), idle=idle), mesh, tuple(clips), dropped, tuple(left_out))
 
 
 def bvh_skeleton(path: Path) -> SkeletonFile:

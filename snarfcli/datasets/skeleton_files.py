@@ -68,6 +68,8 @@ class SkeletonFile:
     """Up axis, y or z; None if the file has none."""
     scale: float | None = None
     """Metres per unit; None if the file has none."""
+    idle: tuple[int, ...] = ()
+    """Joints that move no part of the mesh, as far as the file says so."""
 
 
 @dataclass(frozen=True, eq=False)

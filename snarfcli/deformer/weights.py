@@ -49,6 +49,9 @@ class NodeWeights:
         return interpolate(self.values, canonical, self.grid)
 
 
+_FAR_M = 100.0  # distance of a bone that is nowhere
+
+
 class BonePrior(nn.Module):
     """Logits of skinning weights that fall with the distance to each bone, computed from the skeleton alone.
 
@@ -56,7 +59,7 @@ class BonePrior(nn.Module):
 
     Args:
         segments: [S, 2, 3], ends of the bones' segments, canonical frame, metres.
-        owner: S bone numbers, the bone of each segment; every bone needs at least one.
+        owner: S bone numbers, the bone of each segment; a bone without a segment has no weight anywhere.
         num_bones: J.
         falloff: distance over which a weight falls by a factor e, metres.
     """
@@ -74,7 +77,7 @@ class BonePrior(nn.Module):
         """Return logits [N, J] at points [N, 3], metres, of the canonical frame, or of the frame of `segments` [S, 2, 3]."""
         distances = segment_distances(points, self.segments if segments is None else segments)
         owner = self.owner.expand(len(points), -1)
-        start = distances.new_full((len(points), self.num_bones), torch.inf)
+        start = distances.new_full((len(points), self.num_bones), _FAR_M)
         return start.scatter_reduce(1, owner, distances, "amin") / -self.falloff
 
 

@@ -10,19 +10,25 @@ from snarfcli.bodies import Skeleton
 __all__ = ["bone_owners", "bone_segments", "unpose_by_nearest_bone", "weight_segments"]
 
 
+def _living_bones(skeleton: Skeleton) -> list[tuple[int, int]]:
+    """Return the bones (parent, child) whose joint moves a part of the subject."""
+    return [(parent, child) for parent, child in skeleton.bones if parent not in skeleton.idle]
+
+
 def bone_segments(skeleton: Skeleton, joints: Tensor | None = None) -> Tensor:
     """Return the ends (parent, child) of the bones, [S, 2, 3], metres, in the canonical frame unless `joints` are given.
 
-    A root without children is a point.
+    A root without children is a point. Joints that move nothing have no bones.
     """
     joints = skeleton.canonical_joints if joints is None else joints
     alone = [(joint, joint) for joint in _leaves(skeleton) if skeleton.parents[joint] < 0]
-    return torch.stack([torch.stack([joints[parent], joints[child]]) for parent, child in skeleton.bones + alone])
+    return torch.stack([torch.stack([joints[parent], joints[child]]) for parent, child in _living_bones(skeleton) + alone])
 
 
 def bone_owners(skeleton: Skeleton) -> list[int]:
     """Return the joint that moves each segment of `bone_segments`: the parent."""
-    return [parent for parent, _ in skeleton.bones] + [leaf for leaf in _leaves(skeleton) if skeleton.parents[leaf] < 0]
+    alone = [leaf for leaf in _leaves(skeleton) if skeleton.parents[leaf] < 0]
+    return [parent for parent, _ in _living_bones(skeleton)] + alone
 
 
 def weight_segments(skeleton: Skeleton, *, continued: bool = False) -> tuple[Tensor, list[int]]:
@@ -30,9 +36,10 @@ def weight_segments(skeleton: Skeleton, *, continued: bool = False) -> tuple[Ten
 
     A joint moves the segments to its children; a joint without children moves the point where it is, or, if `continued`, the
     continuation of the bone that ends there, as long as the bone: toes, fingers and the skull lie beyond the last joints.
+    Joints that move nothing have no segments.
     """
     joints = skeleton.canonical_joints
-    ends = [(start, joints[end]) for start, end in skeleton.bones]
+    ends = [(start, joints[end]) for start, end in _living_bones(skeleton)]
     for leaf in _leaves(skeleton):
         before = skeleton.parents[leaf] if continued and skeleton.parents[leaf] >= 0 else leaf
         ends.append((leaf, 2 * joints[leaf] - joints[before]))
@@ -53,7 +60,7 @@ def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: 
     joints = skeleton.canonical_joints.to(vertices)
     leaves = [(joint, joint) for joint in _leaves(skeleton)]
     # Points beyond a last joint (fingers, toes, skull) are as near to that joint as to the end of its parent's bone.
-    pairs = torch.tensor(leaves + skeleton.bones)
+    pairs = torch.tensor(leaves + _living_bones(skeleton))
     ends, moved = joints[pairs], bone_transforms[pairs[:, 0]]
     posed = torch.einsum("src,sec->ser", moved[:, :3, :3], ends) + moved[:, None, :3, 3]
     along = posed[:, 1] - posed[:, 0]
@@ -67,5 +74,5 @@ def unpose_by_nearest_bone(vertices: Tensor, bone_transforms: Tensor, skeleton: 
 
 
 def _leaves(skeleton: Skeleton) -> list[int]:
-    """Return the joints without children."""
-    return sorted(set(range(skeleton.num_joints)) - {parent for parent, _ in skeleton.bones})
+    """Return the joints without children that move a part of the subject."""
+    return sorted(set(range(skeleton.num_joints)) - {parent for parent, _ in skeleton.bones} - set(skeleton.idle))

@@ -44,6 +44,8 @@ def write_subject(folder: Path, subject: SubjectData, inside_test: str) -> None:
         "canonical_pose": skeleton.canonical_pose.numpy().astype(np.float32),
         "betas": np.asarray(subject.betas, np.float32),
     }
+    if skeleton.idle:
+        arrays["idle"] = np.array(skeleton.idle, np.int32)
     if template is not None:
         boundary_edges = check_mesh(template.vertices, template.faces, inside_test, f"the mesh of subject {subject.subject}")
         if boundary_edges:

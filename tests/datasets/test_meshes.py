@@ -18,7 +18,9 @@ from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
+from snarfcli.deformer.weights import BonePrior
 from snarfcli.errors import UserError
+from snarfcli.models.extent import bone_owners, bone_segments, weight_segments
 from snarfcli.samples.preprocessing import preprocess_subject
 from snarfcli.samples.store import SampleStore
 from snarfcli.samples.stored_motion import stored_motion
@@ -281,6 +283,34 @@ def test_last_joints_that_move_nothing_are_left_out(routes, animal, tmp_path):
     assert any(line.startswith("2 end joints that move no vertex were left out (ear, ear_end)") for line in subject.sources)
     assert subject.template.weights.shape[1] == subject.skeleton.num_joints == 19
     same_subject(meshes.load("rex", request(routes["glb"])), subject)
+
+
+def test_a_root_on_the_floor_that_moves_nothing_is_idle(animal, tmp_path):
+    """As artists' rigs have one below the animal: it gets no bone in the shape, and no weights to start from."""
+    rooted = replace(
+        animal,
+        names=("root", *animal.names),
+        parents=(-1, *(parent + 1 for parent in animal.parents)),
+        joints=np.concatenate([[[0.0, 0.0, 0.0]], animal.joints]),
+        weights=np.pad(animal.weights, ((0, 0), (1, 0))),
+    )
+    chosen = [replace(motion, poses=np.pad(motion.poses, ((0, 0), (1, 0), (0, 0)))) for motion in motions()]
+    (tmp_path / "rex.glb").write_bytes(animal_glb(rooted, chosen))
+    subject = meshes.load("rex", request(tmp_path))
+    assert subject.skeleton.idle == (0,)
+    assert any("get no weights and no shape: root" in line for line in subject.sources)
+    assert len(bone_segments(subject.skeleton)) == len(bone_owners(subject.skeleton)) == len(animal.names) - 1
+    assert 0 not in bone_owners(subject.skeleton)
+    segments, owner = weight_segments(subject.skeleton, continued=True)
+    logits = BonePrior(segments, owner, subject.skeleton.num_joints, 0.01)(subject.skeleton.canonical_joints[:1])
+    assert logits.softmax(-1)[0, 0] == 0  # although the point is at the root
+    assert torch.isfinite(logits).all()
+    preprocess_subject(subject, tmp_path, SAMPLING, {"train": 1, "test": 1, "ood": 1})
+    assert SampleStore.open(tmp_path, "meshes", "rex").skeleton.idle == (0,)
+    again = type(subject.skeleton).from_dict(subject.skeleton.to_dict())
+    assert again.idle == subject.skeleton.to(torch.float32).idle == (0,)
+    with pytest.raises(ValueError, match="idle: wanted some joints"):
+        replace(subject.skeleton, idle=(99,))
 
 
 def test_clips_of_several_files_are_joined(routes, animal, tmp_path):

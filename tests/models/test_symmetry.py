@@ -34,6 +34,17 @@ def test_a_body_is_symmetric_where_it_stands(skeleton):
     assert box.upper.tolist() == pytest.approx([1.1, 1, 0.2], abs=0.01)
 
 
+@pytest.mark.parametrize("form", ["{0}_{1}", "{1}.{0}", "{1}_{2}_tip", "{2}{1}", "DEF-{1}.{3}.001", "{0}Up{1}"])
+def test_sides_are_known_in_any_spelling(skeleton, form):
+    sides = {"l": ("l", "Left", "L"), "r": ("r", "Right", "R")}
+    names = [
+        form.format(name[0], name[2:].title(), *sides[name[0]][1:]) if name[:2] in ("l_", "r_") else name
+        for name in skeleton.names
+    ]
+    assert len(set(names)) == len(names)
+    assert replace(skeleton, names=tuple(names)).left_right == skeleton.left_right
+
+
 def test_a_skeleton_without_counterparts_is_not(skeleton):
     bent = skeleton.joints_rest.clone()
     bent[skeleton.names.index("l_hand")] += torch.tensor([0.0, 0.2, 0.0])

@@ -27,6 +27,7 @@ from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
 from snarfcli.models.settings import AvatarConfig, ModelConfig
+from snarfcli.models.shape_sizes import with_shape_sizes
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.models.symmetry import find_mirror
 from snarfcli.models.trained_field import SYSTEMS
@@ -235,6 +236,7 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
     mirror = find_mirror(store.skeleton) if config.skinning.symmetric else None
     extent = surface if mirror is None else mirror.complete(surface)
     skinning = with_grid_sides(config.skinning, extent, store.skeleton)
+    shape = with_shape_sizes(config.shape, surface, store.skeleton)
     grid = CanonicalGrid.around(extent, skinning.margin_m)
     field = None
     if skinning.name == "preset":
@@ -242,7 +244,7 @@ def new_trainer(config: TrainConfig, store: SampleStore, device: torch.device) -
         width, height, depth = skinning.resolution
         field = read_preset_weights(skinning.weights_file, grid, (depth, height, width), store.skeleton.num_joints)
     avatar = Avatar(
-        AvatarConfig(config.model, skinning, search, config.shape, config.condition),
+        AvatarConfig(config.model, skinning, search, shape, config.condition),
         store.skeleton,
         grid,
         surface,

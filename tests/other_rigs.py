@@ -48,10 +48,10 @@ _XSENS = _sided(
 XSENS_NAMES = tuple(name[0].upper() + name[1:] for name in _XSENS)
 
 
-def arms_down() -> Array:
-    """Return a pose [24, 3], radians: the arms hang along the body."""
+def arms(x: float, y: float, z: float) -> Array:
+    """Return a pose [24, 3], radians: the left shoulder is turned by a rotation vector in degrees, the right one mirrored."""
     pose = np.zeros((24, 3))
-    pose[_JOINT["l_shoulder"], 2], pose[_JOINT["r_shoulder"], 2] = np.radians((-85, 85))
+    pose[_JOINT["l_shoulder"]], pose[_JOINT["r_shoulder"]] = np.radians((x, y, z)), np.radians((x, -y, -z))
     return pose
 
 
@@ -75,7 +75,7 @@ class Convention:
 
     names: tuple[str, ...] = CMU_NAMES
     rest_pose: str = "t"
-    """t, a or down: the pose in which the joints' frames are those of the world."""
+    """t, a, down, forward or up: the pose in which the joints' frames are those of the world."""
     along: str = ""
     """Axis (x, y, z) of the joints' frames along which the bones of `limbs` lie; empty: frames as above."""
     limbs: tuple[int, ...] = tuple(range(24))
@@ -117,6 +117,8 @@ CONVENTIONS = {
     "arms_down_without_toes": Convention(
         rest_pose="down", level_hips=True, without=("l_foot", "r_foot", "l_hand", "r_hand"), sole=(0.0, -7.0, 0.0)
     ),
+    "arms_forward": Convention(MIXAMO_NAMES, "forward", facing_deg=120),
+    "arms_up_level": Convention(XSENS_NAMES, "up", level_hips=True, up="z"),
     "legs_along_x": Convention(along="x", limbs=tuple(_LEGS)),
     "limbs_along_x": Convention(MIXAMO_NAMES, along="x", limbs=tuple(_LIMBS), level_hips=True),
     "zero_offsets": Convention(zero_offsets=True, level_hips=True),
@@ -144,7 +146,7 @@ def rig_motion(motion: Motion, convention: Convention) -> RigMotion:
     rotations, places = _posed(motion.poses, motion.translation, joints)
     facing = Rotation.from_euler("y", convention.facing_deg, degrees=True).as_matrix()
     rotations, places = facing @ rotations, places @ facing.T
-    poses = {"t": np.zeros((24, 3)), "a": a_pose(), "down": arms_down()}
+    poses = {"t": np.zeros((24, 3)), "a": a_pose(), "down": arms(0, 0, -85), "forward": arms(0, -85, 0), "up": arms(0, 0, 80)}
     frames = _posed(poses[convention.rest_pose][None], np.zeros((1, 3)), joints)[0][0].transpose(0, 2, 1)
     world = Rotation.from_euler("x", 90 if convention.up == "z" else 0, degrees=True).as_matrix()
     frames = frames @ (Rotation.from_euler("x", 90, degrees=True).as_matrix() if convention.lying else world).T

@@ -14,7 +14,7 @@ from snarfcli.shape import ShapeConfig
 __all__ = ["with_shape_sizes"]
 
 _PERSON_M = 0.055  # median distance of a person's skin from the bones (built-in subjects 50002 and 50004: 0.061 and 0.051)
-_LEAST = 0.4  # finer cells than this share of a person's would need more samples than a short training sees
+_LEAST = 0.65  # with finer cells than this share of a person's a dragon took longer, and was not better
 _MOST_POINTS = 20_000
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.motions.rest_match import LIMB_ROOTS, RestMatch, body_frame, frame_of, smallest_turn, unit
 
-__all__ = ["all_limbs", "clip_turns", "doubtful_limbs", "false_toes"]
+__all__ = ["all_limbs", "clip_turns", "disputed_limbs", "doubtful_limbs", "false_toes"]
 
 Array = NDArray[np.float64]
 
@@ -39,18 +39,26 @@ def all_limbs(match: RestMatch) -> list[str]:
     return [] if body_frame(match.points(0)) is None else ["trunk", *(name for name in LIMB_ROOTS if match.limb(name))]
 
 
-def doubtful_limbs(match: RestMatch) -> list[str]:
-    """Return which parts of a human rig do not rest as in a standing person, of `all_limbs`.
+def doubtful_limbs(match: RestMatch) -> tuple[list[str], list[str]]:
+    """Return which parts of a human rig, of `all_limbs`, do not rest as in a standing person, and which may not.
 
-    Legs must point down; arms may hang, or be raised sideways up to 45 degrees above the horizontal. A limb is doubtful with
-    its opposite one. If the trunk is doubtful, the limbs cannot be judged, so that all are. Nothing is, if
-    the skeleton itself does not rest as a standing person.
+    Legs must point down. Arms may hang, or be raised sideways up to 45 degrees above the horizontal; arms that point forwards
+    or further up may be as they seem, or be twisted in any way. So may limbs that seem right where others are not. A limb is
+    judged with its opposite one. If the trunk is wrong, the limbs cannot be judged, so that all are. Nothing is wrong if the
+    skeleton itself does not rest as a standing person.
     """
     limbs = all_limbs(match)
     if not limbs or _doubtful_kinds(match, 0):
-        return []
+        return [], []
     kinds = _doubtful_kinds(match, 1)
-    return limbs if "trunk" in kinds else [name for name in limbs if name[2:] in kinds]
+    if "trunk" in kinds:
+        return limbs, []
+    wrong = [name for name in limbs if name[2:] in kinds]
+    frame = body_frame(match.points(1))
+    assert frame is not None  # else the trunk is wrong
+    is_odd = bool(wrong) or not _arms_rest(match.points(1), frame, _COS_45)
+    others = [name for name in limbs if name not in wrong and (wrong or name[2:] == "arm") and name != "trunk"]
+    return wrong, others if is_odd else []
 
 
 def _doubtful_kinds(match: RestMatch, side: int) -> list[str]:
@@ -59,7 +67,8 @@ def _doubtful_kinds(match: RestMatch, side: int) -> list[str]:
     frame = body_frame(points)
     if frame is None or not _trunk_stands(points, match.spine_points(side), frame[:, 1]):
         return ["trunk"]
-    return [kind for kind, is_fine in (("arm", _arms_rest), ("leg", _legs_rest)) if not is_fine(points, frame)]
+    fine = {"arm": _arms_rest(points, frame, 2.0), "leg": _legs_rest(points, frame)}
+    return [kind for kind, is_fine in fine.items() if not is_fine]
 
 
 def _trunk_stands(points: Mapping[str, Array], spine: Sequence[Array], up: Array) -> bool:
@@ -84,14 +93,14 @@ def _legs_rest(points: Mapping[str, Array], frame: Array) -> bool:
     return all(-(direction @ frame[:, 1]) > _COS_60 for direction in directions)
 
 
-def _arms_rest(points: Mapping[str, Array], frame: Array) -> bool:
-    """Whether the upper arms hang, or point sideways to their own side, and the elbows are bent by less than a right angle."""
+def _arms_rest(points: Mapping[str, Array], frame: Array, most: float) -> bool:
+    """Whether both arms are straight, on their own side, not backwards, and up or forwards by at most the cosine `most`."""
     for side, sign in (("l", 1), ("r", -1)):
         directions = _directions(points, side, (("shoulder", "elbow"), ("elbow", "wrist")))
         if not directions:
             continue
         left, up, forward = directions[0] @ frame
-        if up > _COS_45 or sign * left < -_COS_60 or abs(forward) > _COS_45:
+        if max(up, forward) > most or sign * left < -_COS_60 or forward < -_COS_45:
             return False
         if len(directions) == 2 and directions[0] @ directions[1] < 0:
             return False
@@ -157,6 +166,25 @@ def clip_turns(
         mean = np.tensordot(weights / weights.sum(), estimates, 1)
         found[joint] = nearest_rotation(torch.from_numpy(mean)).numpy()
     return found
+
+
+def disputed_limbs(
+    match: RestMatch, limbs: Collection[str], turns: Mapping[int, Array], found: Mapping[int, Array]
+) -> list[str]:
+    """Return the limbs, with their opposite ones, in which the clip contradicts the rest pose by more than 45 degrees.
+
+    Args:
+        match: the paired joints at rest.
+        limbs: which limbs are judged.
+        turns: as from `rest_turns`.
+        found: as from `clip_turns`.
+    """
+    kinds = set()
+    for name in limbs:
+        joint = match.parts.get(f"{name[0]}_{'hip' if name.endswith('leg') else 'shoulder'}", -1)
+        if joint in found and np.trace(turns[joint].T @ found[joint]) < 1 + 2 * _COS_45:
+            kinds.add(name[2:])
+    return [name for name in limbs if name[2:] in kinds]
 
 
 def _some(frames: Array) -> Array:

@@ -22,7 +22,7 @@ from snarfcli.bodies import Skeleton
 from snarfcli.errors import UserError, nearest
 from snarfcli.formats.gltf import GLTF_SUFFIXES
 from snarfcli.formats.rig import Rig, RigClip
-from snarfcli.motions.clip_turns import all_limbs, clip_turns, doubtful_limbs, false_toes
+from snarfcli.motions.clip_turns import all_limbs, clip_turns, disputed_limbs, doubtful_limbs, false_toes
 from snarfcli.motions.joint_names import find_body_parts
 from snarfcli.motions.layouts import layout_of
 from snarfcli.motions.mapping import map_joints
@@ -174,16 +174,21 @@ def _turns(match: RestMatch, moved: Mapping[int, Array], posed: Array, rest: str
         path: file of the rig, for messages.
     """
     turns = rest_turns(match, without_bone=false_toes(match, posed))
-    limbs = {"auto": doubtful_limbs, "clip": all_limbs}.get(rest, lambda _: [])(match)
+    if rest == "clip":
+        return turns | clip_turns(match, all_limbs(match), turns, moved, posed)
+    if rest != "auto":
+        return turns
+    limbs, suspected = doubtful_limbs(match)
+    if suspected:
+        limbs += disputed_limbs(match, suspected, turns, clip_turns(match, suspected, turns, moved, posed))
     if not limbs:
         return turns
-    if rest == "auto":
-        log.info(
-            "%s: the rest pose is not that of a standing person (%s), so the frames of the clip were used instead (rest=file"
-            " takes the rest pose as it is, rest=NUMBER that frame)",
-            path.name,
-            ", ".join(name.replace("l_", "left ").replace("r_", "right ") for name in limbs),
-        )
+    log.info(
+        "%s: the rest pose is not that of a standing person (%s), so the frames of the clip were used instead (rest=file"
+        " takes the rest pose as it is, rest=NUMBER that frame)",
+        path.name,
+        ", ".join(name.replace("l_", "left ").replace("r_", "right ") for name in limbs),
+    )
     return turns | clip_turns(match, limbs, turns, moved, posed)
 
 

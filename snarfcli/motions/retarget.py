@@ -13,6 +13,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +28,10 @@ from snarfcli.motions.joint_names import find_body_parts
 from snarfcli.motions.layouts import layout_of
 from snarfcli.motions.mapping import map_joints
 from snarfcli.motions.motion import Motion
-from snarfcli.motions.rest_match import RestMatch
+from snarfcli.motions.rest_match import RestMatch, unit
 from snarfcli.motions.rest_poses import rest_turns
 from snarfcli.motions.rig_rest import resting_in, straightened, turned
-from snarfcli.motions.up_axis import Up, up_axis, y_from_up
+from snarfcli.motions.up_axis import Up, y_from_up
 
 __all__ = ["Retargeted", "choose_clip", "retarget", "retarget_rig"]
 
@@ -40,6 +41,7 @@ Array = NDArray[np.float64]
 
 _LEGS = (("l_hip", "l_knee"), ("l_knee", "l_ankle"), ("r_hip", "r_knee"), ("r_knee", "r_ankle"))
 _MAX_DISTANCE_M = 1e6
+_CLEAR = 0.7  # mean component of a unit vector along an axis that tells the up axis
 _STRETCH = 0.2  # maximum relative difference between the lengths of bones at rest and in the clip
 
 
@@ -148,9 +150,9 @@ def retarget_rig(
     moved = {joint: turned(rig, clip, number, path) for joint, number in pairs.items()}
     posed = clip.world_from_joint[..., :3, 3]
     turns = _turns(match, moved, posed, rest, path)
-    axis = _up(Rotation.from_matrix(moved[0] @ turns[0]), turns[0]) if up == "auto" else up
-    if up == "auto" and axis == "z":
-        log.info("%s: z is up in this file and was turned to y", path.name)
+    axis = _up(match, moved[0] @ turns[0], turns[0], posed) if up == "auto" else up
+    if up == "auto" and axis != "y":
+        log.info("%s: %s is up in this file and was turned to y (up=y keeps it)", path.name, axis)
     upright = np.eye(3) if axis == "y" else y_from_up(axis).as_matrix()
 
     rotations = {joint: upright @ moved[joint] @ turns[joint] for joint in pairs}
@@ -212,10 +214,29 @@ def _local_poses(rotations: Mapping[int, Array], parents: Sequence[int], frames:
     return poses
 
 
-def _up(upright: Rotation, rest: Array) -> Up:
-    """Return the up axis: that along which the body stands during the clip, or if that is not clear, at rest."""
-    mean = upright.apply([0.0, 1.0, 0.0]).mean(0)
-    return up_axis(upright if max(abs(mean[1]), abs(mean[2])) > 0.7 else Rotation.from_matrix(rest[None]))
+def _up(match: RestMatch, pelvis: Array, rest: Array, posed: Array) -> Up:
+    """Return the up axis: that along which the body stands during the clip, or if that is not clear, at rest.
+
+    Both the pelvis and the way from the ankles to the head tell how the body stands. An axis other than y and z counts only if
+    clip and rest pose agree on it: a body may lie, or hang head down, for a whole clip.
+
+    Args:
+        match: the paired joints at rest.
+        pelvis: [T, 3, 3], world rotations of the pelvis of the skeleton.
+        rest: [3, 3], the same at rest.
+        posed: [T, K, 3], places of the rig's joints.
+    """
+    clip, still = pelvis[:, :, 1].mean(0), rest[:, 1]
+    joints = [match.pairs.get(match.parts.get(part, -1)) for part in ("head", "l_ankle", "r_ankle")]
+    if None not in joints:
+        head, left, right = (posed[:, joint] for joint in joints)
+        standing = unit(head - (left + right) / 2).mean(0)
+        clip = (clip + standing) / 2 if np.isfinite(standing).all() else clip
+    axis = int(np.argmax(np.abs(clip)))
+    if abs(clip[axis]) > _CLEAR and clip[axis] * still[axis] > 0 and abs(still[axis]) > _CLEAR:
+        return cast(Up, ("" if clip[axis] > 0 else "-") + "xyz"[axis])
+    clear = clip if max(abs(clip[1]), abs(clip[2])) > _CLEAR else still
+    return "z" if abs(clear[2]) > abs(clear[1]) else "y"
 
 
 def _translation(match: RestMatch, source: Array, root_world: Array) -> Array:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,6 +97,23 @@ def test_thighs_at_the_height_of_the_pelvis_do_not_turn_it_over(tmp_path, subjec
     path = write_bvh(tmp_path / "walk.bvh", source.rig)
     pelvis = Rotation.from_rotvec(read_motion(path, skeleton).poses[:, 0]).as_matrix()
     assert angles_deg(pelvis, source.rotations[:, 0]).max() < 1
+
+
+@pytest.mark.parametrize("degrees", [(0, 0, -90), (0, 0, 90), (180, 0, 0), (-90, 0, 0)], ids=["x", "-x", "-y", "-z"])
+def test_other_up_axes_are_found_if_rest_and_clip_agree(degrees, caplog):
+    source = rig_motion(motion_of("xsens"), CONVENTIONS["xsens"])
+    skeleton = skeleton_of("50002")
+    wanted = retarget(source.rig, source.rig.clips[0], skeleton, path=Path("a.bvh"), name="a")
+    world = np.eye(4)
+    world[:3, :3] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    clip = replace(source.rig.clips[0], world_from_joint=world @ source.rig.clips[0].world_from_joint)
+    rig = replace(source.rig, rest=world @ source.rig.rest, clips=(clip,))
+    with caplog.at_level(logging.INFO, "snarfcli"):
+        turned = retarget(rig, clip, skeleton, path=Path("a.bvh"), name="a")
+    assert "is up in this file and was turned to y" in caplog.text
+    lean = Rotation.from_rotvec(turned.poses[:, 0]).apply([0, 1, 0]) - Rotation.from_rotvec(wanted.poses[:, 0]).apply([0, 1, 0])
+    assert np.abs(lean[:, 1]).max() < 1e-6  # as upright, facing somewhere
+    np.testing.assert_allclose(turned.translation[:, 1], wanted.translation[:, 1], atol=1e-6)
 
 
 def test_a_guessed_rest_pose_is_said_and_can_be_chosen(tmp_path, caplog):

@@ -14,7 +14,7 @@ from snarfcli.shape import ShapeConfig
 __all__ = ["with_shape_sizes"]
 
 _PERSON_M = 0.055  # median distance of a person's skin from the bones (built-in subjects 50002 and 50004: 0.061 and 0.051)
-_LEAST = 0.65  # with finer cells than this share of a person's a dragon took longer, and was not better
+_LEAST = 0.65  # a dragon with 0.4 of a person's had 0.5 % better IoU, 10 million parameters and 60 % longer training
 _MOST_POINTS = 20_000
 
 

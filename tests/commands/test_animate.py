@@ -312,7 +312,7 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"hands": "fists"}, "hands: wanted rest or released, got 'fists'"),
         (
             {"clip": "walk"},
-            "clip: wanted a file ending in .bvh, .glb, .gltf, got pose file .*wave.npz with one motion; leave it out",
+            "clip: wanted a file ending in .bvh, .glb, .gltf, .*, got pose file .*wave.npz with one motion; leave it out",
         ),
         ({"resolution": 15}, "resolution: wanted 16 to 1024, got 15"),
         ({"keep_share": 1.5}, "keep_share: wanted 0 to 1, got 1.5"),

@@ -19,7 +19,7 @@ from snarfcli.errors import UserError
 from snarfcli.samples.store import SampleStore
 
 CHOICE = AvatarSelection("50004", DataConfig("builtin", 8, 1, 1), "data", "outputs", "fast_snarf", None, "cpu", None)
-PLAIN = MotionSelection("auto", "rest", None, None, 0, 30.0, 0, None, 1, None, None, False)
+PLAIN = MotionSelection("auto", "rest", "auto", None, None, 0, 30.0, 0, None, 1, None, None, False)
 
 
 def avatar_of(skeleton: Skeleton, **facts: str) -> SimpleNamespace:

@@ -17,7 +17,7 @@ from snarfcli.motions.anatomy import JOINTS_REST, PARENTS
 
 FRAMES, RATE = 25, 24.0
 AVATAR = AvatarSelection("50002", DataConfig("builtin", 8, 1, 1), "data", "outputs", "fast_snarf", None, "cpu", None)
-PLAIN = MotionSelection("auto", "rest", None, None, 0, 30.0, 0, None, 1, None, None, False)
+PLAIN = MotionSelection("auto", "rest", "auto", None, None, 0, 30.0, 0, None, 1, None, None, False)
 
 
 @pytest.fixture(scope="module")

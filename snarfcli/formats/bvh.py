@@ -25,7 +25,8 @@ _DEFAULT_FRAME_RATE = 60.0
 _MAX_JOINT_FRAMES = 2**21
 _FRAMES = re.compile(r"frames\s*:?\s*(\S*)", re.IGNORECASE)
 _NO_POSITIONS = 0.05  # positions of joints that are all smaller than this share of the OFFSETs are relative to them
-_OTHER_SIZE = 1.25  # bones at rest and in motion that differ by this factor in total length
+_OTHER_SIZE = 1.25  # a bone whose lengths at rest and in motion differ by this factor
+_TRAVELS = 0.3  # share of its length by which a position may change, if it is that of a bone
 _FRAME_TIME = re.compile(r"frame\s*time\s*:?\s*(\S*)", re.IGNORECASE)
 
 
@@ -34,10 +35,10 @@ def read_bvh(path: str | Path) -> Rig:
 
     The reader accepts any names, white space, line ends and letter case. Channels may come in any order, and any joint may have
     position channels; a position replaces the joint's OFFSET, unless all are near zero, which means that they are added to it.
-    Where OFFSETs are zero, or of another size than the positions, the rest pose has the median positions instead. An End Site
-    becomes a joint `<parent>_end` that never rotates; it gives the direction of the last bone. Names that occur twice get a
-    number. A missing frame time, or 0, means 60 frames per second. All complete frames are read, even if the declared number
-    differs; an incomplete last frame is left out.
+    Bones whose length is in the positions only, or in other units there, have the median position at rest; a log line says so.
+    An End Site becomes a joint `<parent>_end` that never rotates; it gives the direction of the last bone. Names that occur
+    twice get a number. A missing frame time, or 0, means 60 frames per second. All complete frames are read, even if the
+    declared number differs; an incomplete last frame is left out.
 
     Args:
         path: the file.
@@ -129,7 +130,10 @@ def _read_frame_rate(lines: BvhLines, word: str) -> float:
 
 
 def _reconcile_positions(joints: list[BvhJoint], values: NDArray[np.float64], path: Path) -> None:
-    """Make OFFSETs and position channels of joints below the root agree, in place, if their sizes differ.
+    """Make OFFSETs and position channels of the bones agree, in place, if lengths are in one of them only, or in other units.
+
+    Joints that only place the body, such as hips below a root on the floor, have no bone above and keep their OFFSETs: those
+    down to the first joint with several children, and those that travel.
 
     Args:
         joints: J joints.
@@ -145,19 +149,46 @@ def _reconcile_positions(joints: list[BvhJoint], values: NDArray[np.float64], pa
         start += len(joint.channels)
     if not columns or not len(values):
         return
-    offsets = np.stack([joints[index].offset for index in columns])
     with np.errstate(over="ignore", invalid="ignore"):
-        medians = np.median(values[:, list(columns.values())], axis=0)
-        sizes, posed = np.linalg.norm(offsets, axis=1), np.linalg.norm(medians, axis=1)
+        placed = values[:, list(columns.values())]
+        medians = np.median(placed, axis=0)
+        posed = np.linalg.norm(medians, axis=1)
+        sizes = np.array([np.linalg.norm(joints[index].offset) for index in columns])
         if posed.sum() < _NO_POSITIONS * sizes.sum():
-            log.info("%s: the positions of joints are near zero and were added to their OFFSETs", path.name)
-            for columns_of_joint, offset in zip(columns.values(), offsets, strict=True):
-                values[:, columns_of_joint] += offset
+            log.info(
+                "%s: the positions of joints are near zero and were added to their OFFSETs; write whole positions otherwise",
+                path.name,
+            )
+            for index, places in columns.items():
+                values[:, places] += joints[index].offset
             return
-        is_other = (sizes == 0) | (not 1 / _OTHER_SIZE < sizes.sum() / max(posed.sum(), 1e-300) < _OTHER_SIZE)
+        places_body = _above_the_branches(joints)
+        is_bone = np.abs(placed - medians).max((0, 2)) <= _TRAVELS * np.maximum(posed, sizes)
+        is_bone &= np.array([index not in places_body for index in columns])
+        is_other = is_bone & ((sizes == 0) | (posed > _OTHER_SIZE * sizes) | (sizes > _OTHER_SIZE * posed))
+        told = is_other & (sizes > 0)
+        ratio = posed[told].sum() / sizes[told].sum() if told.any() else 1.0  # of the units of positions and OFFSETs
+    if not is_other.any():
+        return
+    log.info("%s: OFFSETs do not fit the position channels, so the rest pose has the median positions", path.name)
+    for index, joint in enumerate(joints):
+        if joint.parent >= 0 and index not in columns:
+            joint.offset = ratio * joint.offset
     for index, median, other in zip(columns, medians, is_other, strict=True):
         if other:
             joints[index].offset = median
+
+
+def _above_the_branches(joints: list[BvhJoint]) -> set[int]:
+    """Return the joints from the first root down to the first joint with several children; none in a chain without branches."""
+    children: list[list[int]] = [[] for _ in joints]
+    for index, joint in enumerate(joints):
+        if joint.parent >= 0:
+            children[joint.parent].append(index)
+    chain = [0]
+    while len(children[chain[-1]]) == 1:
+        chain += children[chain[-1]]
+    return {*chain} if children[chain[-1]] else set()
 
 
 def _rest_transforms(joints: list[BvhJoint]) -> NDArray[np.float64]:

@@ -190,6 +190,39 @@ def test_positions_tell_the_rest_pose_where_offsets_do_not(tmp_path, knee, foot)
     np.testing.assert_allclose(rig.clips[0].world_from_joint[1, :3, :3, 3], [[5, 1, 0], [5, -3, 0], [8, -3, 0]], atol=1e-12)
 
 
+def test_hips_that_travel_below_a_root_keep_their_offset(tmp_path):
+    """So two takes of one rig have the same rest pose."""
+    text = """HIERARCHY
+ROOT Reference {{ OFFSET 0 0 0 CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+JOINT Hips {{ OFFSET 0 0 0 CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+JOINT Leg {{ OFFSET 0 -40 0 CHANNELS 3 Zrotation Xrotation Yrotation
+JOINT Foot {{ OFFSET 0 -40 0 CHANNELS 3 Zrotation Xrotation Yrotation End Site {{ OFFSET 0 0 9 }} }} }}
+JOINT Spine {{ OFFSET 0 9 0 CHANNELS 0 }} }} }}
+MOTION
+Frames: 3
+Frame Time: 0.1
+"""
+    for start, step in ((0, 3), (200, 3), (200, 0)):  # walking twice, and standing
+        frames = "".join(f"0 0 0 0 0 0 {start + step * frame} 80 0 0 0 0 0 0 0 0 0 0\n" for frame in range(3))
+        rig = read_bvh(write(tmp_path, text.format() + frames))
+        np.testing.assert_array_equal(rig.rest[:4, :3, 3], [[0, 0, 0], [0, 0, 0], [0, -40, 0], [0, -80, 0]])
+        assert rig.clips[0].world_from_joint[2, 1, 0, 3] == start + 2 * step
+
+
+def test_offsets_without_positions_get_the_units_of_the_positions(tmp_path):
+    text = """HIERARCHY
+ROOT hips {{ OFFSET 0 0 0 CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+JOINT knee {{ OFFSET 0 -0.4 0 CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+JOINT foot {{ OFFSET 0 -0.3 0 CHANNELS 3 Zrotation Xrotation Yrotation End Site {{ OFFSET 0 0 0.1 }} }} }} }}
+MOTION
+Frames: 2
+Frame Time: 0.1
+"""
+    rig = read_bvh(write(tmp_path, text.format() + "0 0 0 0 0 0 0 -40 0 0 0 0 0 0 0\n" * 2))
+    np.testing.assert_allclose(rig.rest[:, :3, 3], [[0, 0, 0], [0, -40, 0], [0, -70, 0], [0, -70, 10]], atol=1e-12)
+    np.testing.assert_allclose(rig.clips[0].world_from_joint[1, :, :3, 3], rig.rest[:, :3, 3], atol=1e-12)
+
+
 def test_positions_near_zero_are_added_to_the_offsets(tmp_path, caplog):
     with caplog.at_level(logging.INFO, "snarfcli"):
         rig = positioned(tmp_path, "0 -4 0", "0 -3 0", "0 0.1 0", "0 0 0")

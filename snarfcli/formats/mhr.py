@@ -63,6 +63,7 @@ _LEFT_AND_MIDDLE = (
 # The axes of the right side are the mirrored and reversed ones of the left.
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
 _ALONG_X = ("l_upleg", "l_lowleg", "l_uparm", "l_lowarm")  # joints whose only child of a kind lies on their x axis
+_MAX_DISTANCE_M = 1e6
 _MAX_DEVIATION = 0.2  # of a unit vector; body shapes move the axis of the thigh by 0.02
 
 
@@ -84,8 +85,10 @@ class MhrTable:
         self.rest = np.stack([joint[3] for joint in joints])
 
 
-def mhr_rig(rotations: Array, positions: Array, frame_rate: float, name: str) -> Rig:
-    """Return the rig of a person that SAM 3D Body saw, with one clip, in the frame of the positions.
+def mhr_rig(rotations: Array, positions: Array, frame_rate: float, name: str) -> tuple[Rig, bool]:
+    """Return the rig of a person that SAM 3D Body saw, with one clip, and whether y is known to point down.
+
+    The rig is in the frame of the positions.
 
     SAM 3D Body turns the positions to the camera (y down) but leaves the rotations with y up; both that and files in which they
     agree are recognised by the directions of the limbs.
@@ -101,14 +104,18 @@ def mhr_rig(rotations: Array, positions: Array, frame_rate: float, name: str) ->
     """
     table = MhrTable()
     turns, places = rotations[:, table.numbers], positions[:, table.numbers]
-    error = np.abs(turns @ turns.transpose(0, 1, 3, 2) - np.eye(3)).max()
-    if error > 1e-3 or np.linalg.det(turns).min() < 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(turns @ turns.transpose(0, 1, 3, 2) - np.eye(3)).max()
+    if not error <= 1e-3 or np.linalg.det(turns).min() < 0:
         raise ValueError("wanted rotation matrices, got others")
+    if not np.abs(places).max() < _MAX_DISTANCE_M:
+        raise ValueError(f"wanted joints within {_MAX_DISTANCE_M / 1000:g} km, got others")
     turned = np.diag([1.0, -1.0, -1.0]) @ turns
     deviations = [_deviation(table, each, places) for each in (turned, turns)]
     if not min(deviations) < _MAX_DEVIATION:
         raise ValueError("wanted rotations that belong to the positions of the joints, got others")
-    turns = (turned, turns)[int(np.argmin(deviations))]
+    is_camera = deviations[0] <= deviations[1]
+    turns = turned if is_camera else turns
     rest = np.tile(np.eye(4), (len(table.names), 1, 1))
     rest[:, :3, :3] = table.rest
     for joint, parent in enumerate(table.parents):
@@ -117,7 +124,7 @@ def mhr_rig(rotations: Array, positions: Array, frame_rate: float, name: str) ->
             rest[joint, :3, 3] = rest[parent, :3, 3] + table.rest[parent] @ offset
     world = np.tile(np.eye(4), (*turns.shape[:2], 1, 1))
     world[..., :3, :3], world[..., :3, 3] = turns, places
-    return Rig(table.names, table.parents, rest, (RigClip(name, frame_rate, world),))
+    return Rig(table.names, table.parents, rest, (RigClip(name, frame_rate, world),)), is_camera
 
 
 def _deviation(table: MhrTable, turns: Array, places: Array) -> float:

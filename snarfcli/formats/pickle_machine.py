@@ -121,7 +121,8 @@ class PickleMachine:
     def push_name(self, module: str | bytes, name: str | bytes) -> None:
         # A name that is not ASCII is never a known one.
         module, name = (str(part, "ascii", "replace") if isinstance(part, bytes) else part for part in (module, name))
-        kind = self.known.get((module, name), self.known.get(_UNKNOWN))
+        kind = self.known.get((module, name)) if module else None  # without a module: the special kinds, not for files to name
+        kind = kind or self.known.get(_UNKNOWN)
         if kind is None:
             raise PickleError(f"asks for {shown(module)}.{shown(name)}, which plain data does not need; nothing was executed")
         self.stack.append(Name(f"{module}.{name}", kind))

@@ -85,6 +85,8 @@ class EstimateReading(Reading):
         """
         super().__init__(budget)
         self.unknown: dict[str, None] = {}
+        self._converted: dict[str, NDArray] = {}  # storages of bfloat16 as float32, by key
+        self._in_bytes: dict[int, tuple[Any, NDArray]] = {}  # storages in bytes, by identity of the node, which is kept alive
         self.stored, self.from_bytes, self.order = stored, from_bytes, order
 
     def value(self, node: Any, depth: int) -> Any:
@@ -111,15 +113,20 @@ class EstimateReading(Reading):
         code, key = _code(parts[1]), self.value(parts[2], depth)
         if not isinstance(key, str):
             raise odd(name)
+        if code == "bfloat16" and key in self._converted:
+            return self._converted[key]
         view = self.stored(key)
         dtype = np.dtype(self.order + ("u2" if code == "bfloat16" else code))
         values = np.frombuffer(view[: len(view) // dtype.itemsize * dtype.itemsize], dtype)
         if code != "bfloat16":
             return values
         self.spend(2 * len(view))
-        return (values.astype(np.uint32) << 16).view(np.float32)
+        self._converted[key] = (values.astype(np.uint32) << 16).view(np.float32)
+        return self._converted[key]
 
     def make_storage_in_bytes(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> NDArray:
+        if len(args) == 1 and id(args[0]) in self._in_bytes:
+            return self._in_bytes[id(args[0])][1]
         content = self.value(args[0], depth) if len(args) == 1 else None
         if self.from_bytes is None or not isinstance(content, bytes):
             raise odd(name)
@@ -127,6 +134,7 @@ class EstimateReading(Reading):
         if not isinstance(storage, np.ndarray) or storage.ndim != 1:
             raise odd(name)
         self.spend(storage.nbytes)
+        self._in_bytes[id(args[0])] = args[0], storage
         return storage
 
     def make_tensor(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> NDArray:
@@ -140,11 +148,15 @@ class EstimateReading(Reading):
         if any(type(n) is not int or not 0 <= n < 2**40 for n in (*size, *strides)):
             raise odd(name)
         count = math.prod(size)
-        self.spend(count * storage.itemsize)
+        rows = tuple(math.prod(size[axis + 1 :]) for axis in range(len(size)))
+        is_own = strides == rows and any(storage is converted for converted in self._converted.values())
+        self.spend(0 if is_own else count * storage.itemsize)
         if count and first + sum((n - 1) * stride for n, stride in zip(size, strides, strict=True)) >= len(storage):
             raise PickleError("has a tensor that is larger than its storage; it is damaged or cut off")
         if not count:
             return self.empty(name, size, storage.dtype)
+        if is_own:
+            return storage[first : first + count].reshape(size)
         steps = [stride * storage.itemsize for stride in strides]
         return np.lib.stride_tricks.as_strided(storage[first:], size, steps).astype(storage.dtype.newbyteorder("="))
 

@@ -122,7 +122,7 @@ def _value_sizes(tree: Any) -> dict[str, int]:
             nodes.extend(node)
         elif isinstance(node, Call) and node.name.kind != "stored":
             nodes.extend((*node.args, node.state, node.items))
-        elif isinstance(node, Call) and isinstance(node.args[0], tuple) and len(node.args[0]) > 2:
+        elif isinstance(node, Call) and len(node.args) == 1 and isinstance(node.args[0], tuple) and len(node.args[0]) > 2:
             what, kind, key = node.args[0][:3]
             if text_of(what) == "storage":
                 sizes[str(text_of(key))] = value_size(kind)

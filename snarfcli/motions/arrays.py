@@ -31,7 +31,8 @@ DEFAULT_FRAME_RATE = 60.0
 VIDEO_FRAME_RATE = 30.0
 """The same for results of video estimators, whose frames are those of the video."""
 _MAX_DISTANCE_M = 1e6
-_MAX_POSITIONS = 1000  # joints
+_MAX_TURN = 4 * np.pi  # radians, of the whole body in one frame
+_MAX_POSITIONS = 200  # joints
 
 
 def motion_from_arrays(arrays: PoseSet, skeleton: Skeleton, path: Path, *, name: str, up: Up, hands: str) -> Motion:
@@ -149,6 +150,8 @@ def _placed(poses: Array, arrays: PoseSet, root_rest: Array, path: Path) -> tupl
     if turns.size != 3 * len(poses) or way.size != 3 * len(poses):
         got = f"{list(turns.shape)} and {list(way.shape)}"
         raise UserError(f"pose file {path}: {key}, {other}: wanted shape [{len(poses)}, 3], got {got}; repair the file")
+    if np.abs(turns).max() > _MAX_TURN or np.abs(way).max() > _MAX_DISTANCE_M:
+        raise UserError(f"pose file {path}: {key}, {other}: wanted radians and metres, got far larger numbers; repair the file")
     rotation = Rotation.from_rotvec(turns.reshape(-1, 3))
     poses = poses.copy()
     poses[:, 0] = (rotation * Rotation.from_rotvec(poses[:, 0])).as_rotvec()
@@ -177,8 +180,8 @@ def _wanted(skeleton: Skeleton) -> str:
 
 def _check_rotations(values: Array, arrays: PoseSet, path: Path) -> None:
     """Raise UserError if the values are positions of joints."""
-    if "poses" in arrays.found and values.shape[1] <= _MAX_POSITIONS and are_positions(values):
-        key = arrays.found["poses"][0]
+    if values.shape[1] <= _MAX_POSITIONS and are_positions(values):
+        key = arrays.found["poses" if "poses" in arrays.found else "body"][0]
         raise UserError(
             f"pose file {path}: {key}: wanted rotations, got joint positions: their distances stay those of a body's bones;"
             " give the file with the rotations, or fit SMPL to the positions first"

@@ -61,13 +61,14 @@ def retarget_mhr(
     if place is not None:
         places = places + place[:, None]
     try:
-        rig = mhr_rig(turns, places, frame_rate_of(arrays, path), name)
+        rig, is_camera = mhr_rig(turns, places, frame_rate_of(arrays, path), name)
     except ValueError as error:
         raise UserError(f"pose file {path}: {key}: {error}; repair the file") from None
     if up == "auto":
-        standing = _standing(rig.names, rig.clips[0].world_from_joint[..., 1, 3])
-        up = "-y" if standing < 0 else "y"
-        if up == "-y":
+        # In files of which rotations and positions are in one frame, only the body tells which that is.
+        is_camera = is_camera or _standing(rig.names, rig.clips[0].world_from_joint[..., 1, 3]) < 0
+        up = "-y" if is_camera else "y"
+        if is_camera:
             log.info("%s: y points down, as in the frame of a camera, and was turned up; up=y keeps it", path.name)
     return retarget_rig(rig, rig.clips[0], skeleton, path=path, name=name, up=up, rest=rest, mapping=mapping)
 

@@ -106,7 +106,8 @@ def _folder_content(path: Path) -> dict[str, Any]:
     suffix = next((suffix for suffix in POSE_SUFFIXES if any(file.suffix.lower() == suffix for file in files)), None)
     files = [file for file in files if suffix is not None and file.suffix.lower() == suffix]
     if not files:
-        raise UserError(f"folder {path} has no .npz files; give a pose file, or a folder with one per frame")
+        wanted = ", ".join(POSE_SUFFIXES)
+        raise UserError(f"folder {path} has no files ending in {wanted}; give a pose file, or a folder with one per frame")
     if len(files) > _MAX_FILES:
         raise UserError(f"folder {path}: wanted at most {_MAX_FILES} {suffix} files, got {len(files)}; give a part of them")
     files.sort(key=_natural)

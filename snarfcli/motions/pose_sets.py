@@ -24,7 +24,7 @@ _MAX_NODES = 200_000
 _MAX_SETS = 100_000
 _MAX_VALUES = 2**24
 _MAX_LISTED = 500_000  # numbers in nested lists; a pickle with more takes too many steps, but may repeat shorter lists
-_PICTURE = re.compile(r".*\.(jpe?g|png|bmp|tiff?|webp|npz|npy|pkl|pickle|pt|pth)", re.IGNORECASE)
+_PICTURE = re.compile(r".*\.(jpe?g|png|bmp|tiff?|webp|npz|npy|pkl|pickle|joblib|pt|pth)", re.IGNORECASE)
 _PERSON_IDS = ("track_ids", "tracked_ids", "tid", "person_ids", "ids")
 _DETECTIONS = ("center_confs", "center_preds")  # ROMP's result of one picture: the first axis is that of the persons
 
@@ -99,7 +99,7 @@ def choose_set(sets: Sequence[PoseSet], clip: str | int | None, path: Path) -> P
             log.info("%s: motion 0 of %d is used; others by clip=NAME or number (%s)", path.name, len(sets), shown)
     elif str(clip) in labels:
         chosen = sets[labels.index(str(clip))]
-    elif str(clip).isdecimal() and int(clip) < len(sets):
+    elif str(clip).isdecimal() and len(str(clip)) < 10 and int(clip) < len(sets):
         chosen = sets[int(clip)]
     else:
         raise UserError(f"{path} has no motion {str(clip)[:40]!r}{nearest(str(clip), labels) or '.'} It has {shown}")

@@ -115,7 +115,7 @@ def read_motion_and_source(
     if not path.exists():
         raise UserError(f"no pose file at {path}")
     if suffix not in POSE_SUFFIXES and not path.is_dir():
-        wanted = f"a file ending in {', '.join(MOTION_SUFFIXES)}, or a folder of .npz files"
+        wanted = f"a file ending in {', '.join(MOTION_SUFFIXES)}, or a folder of pose files"
         raise UserError(f"pose file {path}: wanted {wanted}; convert it")
     sets = read_pose_sets(path)
     if clip is not None and len(sets) == 1:

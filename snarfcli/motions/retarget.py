@@ -77,7 +77,7 @@ def choose_clip(rig: Rig, clip: str | int | None, path: Path) -> RigClip:
         return rig.clips[0]
     if str(clip) in names:
         return rig.clips[names.index(str(clip))]
-    if str(clip).isdecimal() and int(clip) < len(names):
+    if str(clip).isdecimal() and len(str(clip)) < 10 and int(clip) < len(names):
         return rig.clips[int(clip)]
     found = ", ".join(f"{name[:40]!r}" for name in names[:20])
     raise UserError(f"{path} has no clip {clip!r:.60}{nearest(str(clip), names) or '.'} It has {found}")
@@ -177,6 +177,8 @@ def _turns(match: RestMatch, moved: Mapping[int, Array], posed: Array, rest: str
     """
     turns = rest_turns(match, without_bone=false_toes(match, posed))
     if rest == "clip":
+        if not all_limbs(match):
+            raise UserError(f"{path}: rest=clip: wanted the skeleton of a person, got another; leave it out")
         return turns | clip_turns(match, all_limbs(match), turns, moved, posed)
     if rest != "auto":
         return turns

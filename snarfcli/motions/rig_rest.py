@@ -15,19 +15,19 @@ from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.errors import UserError
 from snarfcli.formats.rig import Rig, RigClip
 
-__all__ = ["RESTS", "check_rest", "resting_in", "straightened", "turned"]
+__all__ = ["check_rest", "resting_in", "straightened", "turned"]
 
 Array = NDArray[np.float64]
 
-RESTS = ("auto", "file", "clip")
-"""Choices for the rest pose of a rig, besides the number of a frame."""
+_RESTS = ("auto", "file", "clip")  # choices besides the number of a frame
+_DIGITS = 10  # of the number of a frame
 _SAME_SKELETON_M = 1e-3  # maximum difference of joint positions, relative to their parents, in two files of one skeleton
 
 
 def check_rest(rest: str) -> None:
     """Raise UserError if `rest` is neither in `RESTS` nor the number of a frame."""
-    if rest not in RESTS and not rest.isdecimal():
-        raise UserError(f"rest: wanted {', '.join(RESTS)} or the number of a frame, got {rest!r:.60}")
+    if rest not in _RESTS and not (rest.isdecimal() and len(rest) < _DIGITS):
+        raise UserError(f"rest: wanted {', '.join(_RESTS)} or the number of a frame, got {rest!r:.60}")
 
 
 def resting_in(rig: Rig, clip: RigClip, frame: int, path: Path) -> Rig:

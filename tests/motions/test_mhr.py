@@ -83,6 +83,21 @@ def test_orientations_may_be_those_of_the_camera_or_of_a_world_with_y_up(tmp_pat
         np.testing.assert_allclose(motion.translation, wanted.translation, atol=1e-6)
 
 
+def test_a_handstand_stays_one(tmp_path, caplog):
+    """Rotations with y up tell that the positions have y down, whatever the body does."""
+    person = mhr_person(POSED)
+    over = np.diag([-1, -1, 1]).astype(np.float32)  # by half a turn about the view, in the camera and in the world alike
+    arrays = {**person, "pred_global_rots": over @ person["pred_global_rots"]}
+    arrays |= {key: person[key] @ over for key in ("pred_joint_coords", "pred_cam_t")}
+    np.savez(tmp_path / "a.npz", **arrays)
+    with caplog.at_level("INFO", "snarfcli"):
+        motion = read_motion(tmp_path / "a.npz")
+    assert "y points down" in caplog.text
+    np.savez(tmp_path / "b.npz", **person)
+    wanted = Rotation.from_matrix(over) * Rotation.from_rotvec(read_motion(tmp_path / "b.npz").poses[:, 0])
+    assert (wanted.inv() * Rotation.from_rotvec(motion.poses[:, 0])).magnitude().max() < 1e-5
+
+
 def single(turns):
     return {key: value[0] for key, value in mhr_person(turns).items()}
 

@@ -88,7 +88,9 @@ def test_equal_samples_through_every_route(tmp_path):
 def test_folders_that_are_no_frames(tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
-    with pytest.raises(UserError, match=r"frames has no .npz files; give a pose file, or a folder with one per frame"):
+    with pytest.raises(
+        UserError, match=r"frames has no files ending in .npz, .npy, .*; give a pose file, or a folder with one per frame"
+    ):
         read_motion(folder)
     np.savez(folder / "a_2.npz", pose=np.zeros(72), transl=np.zeros(3))
     np.savez(folder / "a_10.npz", pose=np.zeros(72))

@@ -103,7 +103,11 @@ def run(config: DoctorConfig) -> int:
 
 
 def _check_pose(config: DoctorConfig, pose: str) -> int:
-    """Report how a motion file is read, and draw it; 2 if it cannot be used."""
+    """Report how a motion file is read, and draw it; return 0.
+
+    Raises:
+        UserError: it cannot be used.
+    """
     from snarfcli.checks import check_choice
     from snarfcli.commands.doctor_pose import PoseQuestion, check_pose
     from snarfcli.datasets.sources import Request
@@ -112,7 +116,8 @@ def _check_pose(config: DoctorConfig, pose: str) -> int:
 
     check_choice("up", config.up, UPS)
     check_choice("hands", config.hands, HANDS)
-    request = None if config.data is None else Request(config.data, Path(config.data_root), config.body)
+    data = DataConfig(name="builtin") if config.data is None and config.subject is not None else config.data
+    request = None if data is None else Request(data, Path(config.data_root), config.body)
     question = PoseQuestion(pose, config.up, config.hands, config.rest, config.mapping, config.clip, request, config.subject)
     name = Path(pose).stem
     check_pose(question, Path(config.figure or Path(config.output_root) / "doctor" / f"{name}.png"))

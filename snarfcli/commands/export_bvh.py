@@ -36,6 +36,7 @@ __all__ = ["write_motions"]
 
 log = logging.getLogger(__name__)
 
+_UPS = ("auto", "y", "z")
 _Part = tuple[Skeleton, Clip, BvhOptions]
 """The content of one file."""
 
@@ -95,8 +96,9 @@ def _part_of_file(config: ExportConfig, pose: str | None, motion: str | None) ->
     if pose is None:
         whole = builtin_motion(motion or "jumping_jacks", config.motion_seed, frame_rate=config.motion_frame_rate)
     else:
-        whole = read_motion(pose, skeleton, up=cast(Up, config.up), hands=config.hands)
-        log.info("%s has no skeleton: that of an average adult is written; give skeleton=avatar for another", pose)
+        settings = {"hands": config.hands, "rest": config.rest, "mapping": config.mapping, "clip": config.clip}
+        whole = read_motion(pose, skeleton, up=cast(Up, config.up), **settings)
+        log.info("%s: the skeleton of an average adult is written; give skeleton=avatar for another", pose)
     units = UNITS["cm" if config.bvh.units == "auto" else config.bvh.units]
     options = BvhOptions(units, up="z" if config.bvh.up == "z" else "y", order=config.bvh.order)
     return skeleton, Clip(select_frames(config, whole).motion), options
@@ -104,8 +106,11 @@ def _part_of_file(config: ExportConfig, pose: str | None, motion: str | None) ->
 
 def _part_of_rig(config: ExportConfig, path: Path) -> _Part:
     """Return a clip of a file on the file's skeleton, in its units and axes unless others are wanted."""
-    if config.mapping is not None:
-        log.warning("mapping: not used with skeleton=file, whose joints stay as they are")
+    for name, is_given in (("mapping", config.mapping is not None), ("rest", config.rest != "auto")):
+        if is_given:
+            log.warning("%s: not used with skeleton=file, whose joints stay as they are", name)
+    if config.up not in _UPS:
+        raise UserError(f"up: wanted {', '.join(_UPS)} with skeleton=file, got {config.up}; give skeleton=avatar")
     rig = read_rig(path)
     skeleton, clip = rig_clip(rig, choose_clip(rig, config.clip, path), path)
     is_bvh = path.suffix.lower() == ".bvh"

@@ -18,6 +18,7 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, Motion, builtin_motion, read_motion
 from snarfcli.motions.layouts import HANDS, SMPL, layout_of
+from snarfcli.motions.rig_rest import check_rest
 from snarfcli.motions.up_axis import UPS, Up
 from snarfcli.runs import choose_device, find_avatar, run_folder, set_threads
 from snarfcli.samples.stored_motion import stored_motion
@@ -70,9 +71,10 @@ class MotionSelection:
     hands: str = MISSING
     """SMPL's hand joints if the pose file has fingers: rest (straight), or released (as in the papers' code)."""
     rest: str = MISSING
-    """For .bvh and .glb: rest pose to compare with the avatar's: auto, file, clip (all frames), or the number of a frame."""
+    """For files with joints of their own (.bvh, .glb, .vrm, SAM 3D Body): rest pose to compare with the avatar's: auto, file,
+    clip (all frames), or the number of a frame."""
     mapping: str | None = MISSING
-    """For .bvh and .glb: JSON file {joint of the avatar: joint of the pose file}; null matches common joint names."""
+    """For such files: JSON file {joint of the avatar: joint of the pose file}; null matches common joint names."""
     clip: str | None = MISSING
     """Name or number of the animation (.bvh, .glb), or of the person in a video's results; null for the first."""
     motion_seed: int = MISSING
@@ -134,6 +136,7 @@ def check_motion_selection(choice: MotionSelection) -> None:
     """
     for name, choices in (("up", UPS), ("hands", HANDS)):
         check_choice(name, getattr(choice, name), choices)
+    check_rest(choice.rest)
     for name, least in (("step", 1), ("max_frames", 1), ("motion_seed", 0)):
         check_number(name, getattr(choice, name), least)
     for name in ("motion_frame_rate", "frame_rate"):

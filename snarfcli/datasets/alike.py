@@ -17,7 +17,7 @@ __all__ = ["find_twins", "is_named_rest", "is_still", "pose_points"]
 _TOLERANCE = 0.01  # share of the skeleton's size; a breathing animal moves by more
 _LEVER = 0.2  # share of the skeleton's size; so a joint at the end of a chain counts from 3 degrees
 _TRUNK = 0.75  # share of the joints that hang on the trunk
-_REST_NAME = re.compile(r"(^|.*\b)(((rest|bind|default|reference|ref|neutral|[ta]) ?pose)|rest|bind)( ?\d+)?$")
+_REST_NAME = re.compile(r"(^|.*\b)(((rest|bind|default|reference|ref|neutral) ?pose)|rest|bind)( ?\d+)?$|^[ta] ?pose( ?\d+)?$")
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
 
@@ -25,11 +25,11 @@ def is_named_rest(name: str) -> bool:
     """Return whether a clip is a rest pose by its name: `Rest_Pose`, `TPose`, `Armature|bind pose`, but not `walk to rest`."""
     words = " ".join(word.lower() for word in _WORD.findall(re.split(r"[|:]", name)[-1]))
     found = _REST_NAME.match(words)
-    return found is not None and (found[1] == "" or "pose" in words)
+    return found is not None and (not found[1] or "pose" in words)
 
 
 def pose_points(posed_from_rest: NDArray, joints_rest: NDArray, parents: Sequence[int]) -> NDArray[np.float32]:
-    """Return points [T, P, 3] that tell poses apart, whatever the place and direction of the whole subject; 1 is its size.
+    """Return points [T, P, 3] that differ between poses, but not with place and direction of the whole subject; 1 is its size.
 
     Each joint carries four points. They are seen from the trunk, the last joint on the way down from the root that still
     carries most others: in some files it is the root that moves through the world, in others the hips below it.

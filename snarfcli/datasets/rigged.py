@@ -47,15 +47,15 @@ def read_rigged_files(paths: Sequence[Path]) -> RiggedFiles:
     vertex, since each joint needs a weight at every point.
 
     Raises:
-        UserError: a file cannot be read or has another skeleton than the file with the mesh, or no file has a mesh.
+        UserError: no file can be read, a file has another skeleton than the file with the mesh, or no file has a mesh.
     """
-    rigs = {path: read_gltf(path) for path in paths}
+    rigs, left_out = _readable(paths)
     skinned = next(((path, rig, rig.mesh) for path, rig in rigs.items() if rig.mesh is not None), None)
     if skinned is None:
         raise UserError(f"{paths[0]} has no mesh that its joints move; export it with its skin, or give meshes as files")
     path, first, whole = skinned
     kept = _moving_joints(first, whole.weights)
-    clips, left_out = [], []
+    clips = []
     for other, rig in rigs.items():
         left_out += rig.left_out
         if not rig.clips:
@@ -77,6 +77,22 @@ def read_rigged_files(paths: Sequence[Path]) -> RiggedFiles:
     mesh = RigMesh(whole.vertices, whole.faces, whole.weights[:, kept])
     idle = tuple(np.flatnonzero(~np.any(mesh.weights > 0, axis=0)).tolist())
     return RiggedFiles(replace(_skeleton(first, kept), idle=idle), mesh, tuple(clips), dropped, tuple(left_out))
+
+
+def _readable(paths: Sequence[Path]) -> tuple[dict[Path, Rig], list[tuple[str, str]]]:
+    """Return the rigs of the files that can be read; and name and reason of the others, whose motions are left out."""
+    rigs: dict[Path, Rig] = {}
+    left_out: list[tuple[str, str]] = []
+    problem = None
+    for path in paths:
+        try:
+            rigs[path] = read_gltf(path)
+        except UserError as error:
+            problem = problem or error
+            left_out.append((path.stem, str(error)))
+    if problem is not None and not any(rig.mesh is not None for rig in rigs.values()):
+        raise problem
+    return rigs, left_out
 
 
 def bvh_skeleton(path: Path) -> SkeletonFile:

@@ -60,7 +60,7 @@ class ShapeBasis:
     def two_sided(self, weights: Sequence[NDArray[np.float32]]) -> tuple[ShapeBasis, list[NDArray[np.float32]]]:
         """Return an equivalent basis with one target per component and direction, and its weights, from 0 to 1.
 
-        With all weights at 0, as programs show a character that nobody drives, it has the mean shape. Directions that no clip
+        With all weights at 0, as programs show it without a motion, it has the mean shape. Directions that no clip
         uses are left out.
         """
         if not len(self.targets):

@@ -36,7 +36,7 @@ def parse_off(content: bytes) -> Surface:
     num_lines = sum(1 for _ in text_lines(content)) - lines_taken
     words = chain(rest, chain.from_iterable(lines)) if num_lines < num_vertices + num_faces else None
     width = 3
-    if words or num_lines >= 2 * num_vertices + num_faces:  # else each vertex has its line, whatever the header says
+    if words or num_lines >= 2 * num_vertices + num_faces:  # else each vertex has a line of its own
         width += sum(count for name, count in _EXTRAS.items() if name in kind) - (b"C" in kind and not words)
 
     def fill(record: list[bytes], least: int) -> list[bytes]:

@@ -33,7 +33,7 @@ from snarfcli.motions.rest_poses import rest_turns
 from snarfcli.motions.rig_rest import resting_in, straightened, turned
 from snarfcli.motions.up_axis import Up, y_from_up
 
-__all__ = ["Retargeted", "choose_clip", "retarget", "retarget_rig"]
+__all__ = ["Retargeted", "choose_clip", "retarget_rig"]
 
 log = logging.getLogger(__name__)
 
@@ -81,21 +81,6 @@ def choose_clip(rig: Rig, clip: str | int | None, path: Path) -> RigClip:
         return rig.clips[int(clip)]
     found = ", ".join(f"{name[:40]!r}" for name in names[:20])
     raise UserError(f"{path} has no clip {clip!r:.60}{nearest(str(clip), names) or '.'} It has {found}")
-
-
-def retarget(
-    rig: Rig,
-    clip: RigClip,
-    skeleton: Skeleton,
-    *,
-    path: Path,
-    name: str,
-    up: Up = "auto",
-    rest: str = "auto",
-    mapping: str | Path | Mapping[str, str | None] | None = None,
-) -> Motion:
-    """Return the motion that `retarget_rig` makes of a clip."""
-    return retarget_rig(rig, clip, skeleton, path=path, name=name, up=up, rest=rest, mapping=mapping).motion
 
 
 def retarget_rig(
@@ -172,7 +157,7 @@ def _turns(match: RestMatch, moved: Mapping[int, Array], posed: Array, rest: str
         match: the paired joints at rest.
         moved: [T, 3, 3] per paired joint, world rotations of the rig's joints relative to their rest.
         posed: [T, K, 3], places of the rig's joints.
-        rest: which rest pose counts, as in `retarget`.
+        rest: which rest pose counts, as in `retarget_rig`.
         path: file of the rig, for messages.
     """
     turns = rest_turns(match, without_bone=false_toes(match, posed))

@@ -46,6 +46,13 @@ def test_poses_have_no_skeleton_of_their_own(here, caplog):
     assert Image.open("here.png").size[1] < 360 * 2
 
 
+def test_a_subject_is_one_of_the_built_in_ones(here, caplog):
+    caplog.set_level("INFO", logger="snarfcli")
+    np.savez("dance.npz", poses=MOTION.poses.reshape(-1, 72))
+    assert main(["doctor", "--pose=dance.npz", "subject=50009"]) == 0
+    assert "on subject 50009 of builtin" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

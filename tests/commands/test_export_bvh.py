@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 from pathlib import Path
 
@@ -102,12 +103,25 @@ def test_files_without_skeleton_get_that_of_an_adult(capsys, caplog):
     motion = builtin_motion("lunges", 0, frame_rate=30).slice(stop=4)
     np.savez("walk.npz", poses=motion.poses.reshape(4, -1), trans=motion.translation, mocap_framerate=30.0)
     assert export(capsys, "skeleton=file", "--pose", "walk.npz", "up=y", "names=mixamo", "output=a.bvh")[0] == 0
-    assert "walk.npz has no skeleton: that of an average adult is written" in caplog.text
+    assert "walk.npz: the skeleton of an average adult is written" in caplog.text
     np.testing.assert_allclose(read_motion("a.bvh", average_skeleton()).poses, motion.poses, atol=1e-6)
     assert export(capsys, "skeleton=file", "motion=[punching]", "frame_rate=60", "max_frames=5", "bvh.up=z")[0] == 0
     rig = read_bvh("outputs/export/punching.bvh")
     assert (len(rig.clips[0].world_from_joint), rig.clips[0].frame_rate) == (5, 60)
     assert rig.rest[rig.names.index("head"), 2, 3] > 40
+
+
+def test_the_person_of_a_pose_file_is_chosen(capsys):
+    persons = {name: {"poses": np.zeros((frames, 72))} for name, frames in (("anna", 4), ("ben", 9))}
+    Path("two.pkl").write_bytes(pickle.dumps(persons))
+    assert export(capsys, "skeleton=file", "--pose", "two.pkl", "clip=ben", "output=a.bvh")[0] == 0
+    assert len(read_bvh("a.bvh").clips[0].world_from_joint) == 9
+    code, err = export(capsys, "skeleton=file", "--pose", "two.pkl", "mapping=none.json", "output=b.bvh")
+    assert code == 2
+    assert "mapping: wanted" in err
+    code, err = export(capsys, "skeleton=file", "--pose", "a.bvh", "up=x", "output=b.bvh")
+    assert code == 2
+    assert "up: wanted auto, y, z with skeleton=file" in err
 
 
 def test_a_clip_of_a_gltf_file(capsys):

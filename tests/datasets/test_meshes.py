@@ -326,6 +326,16 @@ def test_clips_of_several_files_are_joined(routes, animal, tmp_path):
         np.testing.assert_allclose(mine.motion.poses, theirs.motion.poses, atol=1e-6)
 
 
+def test_a_damaged_file_leaves_the_others_usable(animal, tmp_path):
+    (tmp_path / "rex").mkdir()
+    for name in ("sit", "sniff"):
+        (tmp_path / "rex" / f"{name}.glb").write_bytes(animal_glb(animal, motions(name)))
+    (tmp_path / "rex" / "broken.glb").write_bytes(b"glTF and then nothing")
+    subject = meshes.load("rex", request(tmp_path))
+    assert sorted(spec.name for spec in subject.sequences) == ["sit", "sniff"]
+    assert any("broken" in line for line in subject.warnings)
+
+
 def test_files_of_two_skeletons_are_told_apart(animal, tmp_path):
     (tmp_path / "rex").mkdir()
     (tmp_path / "rex" / "a.glb").write_bytes(animal_glb(animal, motions("sit")))

@@ -107,7 +107,8 @@ def test_if_nothing_moves_other_poses_are_held_out(tmp_path, animal):
     ("name", "expected"),
     [("Rest_Pose", True), ("rest", True), ("TPose", True), ("T-Pose", True), ("a pose", True), ("Armature|Bind_Pose", True),
      ("RestPose_02", True), ("fox_rest_pose", True), ("bind", True), ("Walk", False), ("walk_to_rest", False),
-     ("Resting", False), ("Interest", False), ("Pose", False), ("Fall", False), ("panda pose", False), ("", False)],
+     ("Resting", False), ("Interest", False), ("Pose", False), ("Fall", False), ("panda pose", False), ("", False),
+     ("Dance_A_Pose", False), ("Take_a_pose", False)],
 )  # fmt: skip
 def test_names_of_rest_poses(name, expected):
     assert is_named_rest(name) == expected

@@ -20,7 +20,7 @@ from snarfcli.errors import UserError
 from snarfcli.formats.rig import Rig
 from snarfcli.motions import TRAINING_SEQUENCES, builtin_motion, read_motion
 from snarfcli.motions.motion import Motion
-from snarfcli.motions.retarget import retarget
+from snarfcli.motions.retarget import retarget_rig
 
 SUBJECTS = ("50002", "50009", "50020")
 FOOT_M = 0.02
@@ -45,7 +45,7 @@ def skeleton_of(subject):
 def read(tmp_path, source, skeleton, **options) -> Motion:
     convention = source.convention
     if convention.zero_offsets:  # BVH would take the lengths of the position channels
-        return retarget(source.rig, source.rig.clips[0], skeleton, path=tmp_path / "a.glb", name="a", **options)
+        return retarget_rig(source.rig, source.rig.clips[0], skeleton, path=tmp_path / "a.glb", name="a", **options).motion
     path = write_bvh(tmp_path / "walk.bvh", source.rig, convention.order, convention.end)
     return read_motion(path, skeleton, **options)
 
@@ -103,13 +103,13 @@ def test_thighs_at_the_height_of_the_pelvis_do_not_turn_it_over(tmp_path, subjec
 def test_other_up_axes_are_found_if_rest_and_clip_agree(degrees, caplog):
     source = rig_motion(motion_of("xsens"), CONVENTIONS["xsens"])
     skeleton = skeleton_of("50002")
-    wanted = retarget(source.rig, source.rig.clips[0], skeleton, path=Path("a.bvh"), name="a")
+    wanted = retarget_rig(source.rig, source.rig.clips[0], skeleton, path=Path("a.bvh"), name="a").motion
     world = np.eye(4)
     world[:3, :3] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
     clip = replace(source.rig.clips[0], world_from_joint=world @ source.rig.clips[0].world_from_joint)
     rig = replace(source.rig, rest=world @ source.rig.rest, clips=(clip,))
     with caplog.at_level(logging.INFO, "snarfcli"):
-        turned = retarget(rig, clip, skeleton, path=Path("a.bvh"), name="a")
+        turned = retarget_rig(rig, clip, skeleton, path=Path("a.bvh"), name="a").motion
     assert "is up in this file and was turned to y" in caplog.text
     lean = Rotation.from_rotvec(turned.poses[:, 0]).apply([0, 1, 0]) - Rotation.from_rotvec(wanted.poses[:, 0]).apply([0, 1, 0])
     assert np.abs(lean[:, 1]).max() < 1e-6  # as upright, facing somewhere
@@ -179,7 +179,7 @@ def test_collars_grow_continuously_into_the_direction_of_the_rig(tmp_path):
             arm = [side, side + 2, side + 4, side + 6]
             rest[arm, :3, 3] += lift
         rig = Rig(rig.names, rig.parents, rest, rig.clips)
-        poses = retarget(rig, rig.clips[0], skeleton, path=tmp_path / "a.glb", name="a").poses
+        poses = retarget_rig(rig, rig.clips[0], skeleton, path=tmp_path / "a.glb", name="a").motion.poses
         turns.append(Rotation.from_rotvec(poses[0, 13]).as_matrix())
     steps = angles_deg(np.stack(turns[:-1]), np.stack(turns[1:]))
     assert steps.max() < 4

@@ -20,7 +20,7 @@ from snarfcli.errors import UserError
 from snarfcli.formats.rig import Rig, RigClip
 from snarfcli.motions import builtin_motion, read_motion
 from snarfcli.motions.anatomy import JOINTS_REST, PARENTS, joint_positions
-from snarfcli.motions.retarget import choose_clip, retarget
+from snarfcli.motions.retarget import choose_clip, retarget_rig
 
 STANDING = builtin_motion("jumping_jacks", 3, duration_s=0.5)
 EXTREME = builtin_motion("deep_squats", 1, duration_s=0.5)
@@ -66,7 +66,7 @@ def test_its_own_rig_may_rest_in_another_pose(motion, scale):
     at = np.tile(np.eye(4), (len(motion.poses) + 1, 24, 1, 1))
     at[:, :, :3, :3], at[:, :, :3, 3] = frames[1][:, :, :3, :3], scale * frames[0].numpy()
     rig = Rig(SMPL_JOINT_NAMES, PARENTS, at[0], (RigClip("own", motion.frame_rate, at[1:]),))
-    back = retarget(rig, rig.clips[0], skeleton, path=Path("own.glb"), name="own")
+    back = retarget_rig(rig, rig.clips[0], skeleton, path=Path("own.glb"), name="own").motion
     difference = Rotation.from_rotvec(back.poses.reshape(-1, 3)).inv() * Rotation.from_rotvec(motion.poses.reshape(-1, 3))
     assert difference.magnitude().max() < 1e-6
     np.testing.assert_allclose(back.translation, motion.translation, atol=1e-6)
@@ -169,7 +169,7 @@ def test_scaled_joints_and_float32(tmp_path):
     size = np.diag([100.0, 100, 100, 1])
     posed = (rig.clips[0].world_from_joint @ size).astype(np.float32).astype(np.float64)
     rig = Rig(rig.names, rig.parents, rig.rest @ size, (RigClip("walk", 30.0, posed),))
-    back = retarget(rig, rig.clips[0], smpl(), path=tmp_path / "a.glb", name="a")
+    back = retarget_rig(rig, rig.clips[0], smpl(), path=tmp_path / "a.glb", name="a").motion
     np.testing.assert_allclose(places(back), places(STANDING), atol=2e-6)
 
 
@@ -278,7 +278,7 @@ def test_rigs_that_cannot_be_used(tmp_path):
         (replace(rig, rest=rig.rest * np.nan), "has NaN or infinity in its rest pose"),
     ):
         with pytest.raises(UserError, match=message):
-            retarget(bad, bad.clips[0], smpl(), path=path, name="a")
+            retarget_rig(bad, bad.clips[0], smpl(), path=path, name="a")
 
 
 def test_the_built_in_body_takes_it_too(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-__all__ = ["UserError", "nearest", "one_line"]
+__all__ = ["UserError", "nearest"]
 
 
 class UserError(ValueError):
@@ -19,17 +19,3 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """Return `"; did you mean 'x'?"` with the valid name closest to `name`, or an empty string if none is similar."""
     match = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.5)
     return f"; did you mean {match[0][:60]!r}?" if match else ""  # names read from files can contain any character
-
-
-def one_line(reason: str | BaseException, longest: int | None = None) -> str:
-    """Return a text, or the message of an exception, as one printable line.
-
-    Line breaks and control characters become spaces, and repeated spaces one.
-
-    Args:
-        reason: the text or exception; an exception without a message gives the name of its type.
-        longest: maximum number of characters; None for no limit. Needed for messages that quote untrusted files.
-    """
-    text = reason if isinstance(reason, str) else str(reason) or type(reason).__name__
-    line = " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
-    return line[:longest]

@@ -17,7 +17,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from snarfcli.errors import UserError, one_line
+from snarfcli.errors import UserError
+from snarfcli.texts import one_line
 
 __all__ = [
     "MAX_ARRAY_BYTES",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import re
 
-from snarfcli.errors import UserError, one_line
+from snarfcli.errors import UserError
+from snarfcli.texts import one_line
 
 __all__ = ["user_message"]
 

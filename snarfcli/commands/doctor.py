@@ -18,8 +18,8 @@ from omegaconf import MISSING
 
 import snarfcli
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.errors import one_line
 from snarfcli.parallel import count_cores
+from snarfcli.texts import one_line
 from snarfcli.versions import RECORDED_PACKAGES, installed_version
 
 __all__ = ["DoctorConfig", "Finding", "run"]

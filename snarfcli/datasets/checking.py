@@ -16,10 +16,11 @@ from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subject_size import subject_length
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
-from snarfcli.errors import UserError, one_line
+from snarfcli.errors import UserError
 from snarfcli.sampling import check_mesh
 from snarfcli.sampling.occupancy import winding_numbers
 from snarfcli.segments import distance_to_segments
+from snarfcli.texts import one_line
 
 __all__ = ["ExaminedFrame", "Remark", "check_subject"]
 

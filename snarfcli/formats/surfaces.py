@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.errors import UserError, one_line
+from snarfcli.errors import UserError
 from snarfcli.formats.gltf import read_gltf_surface
 from snarfcli.formats.off import parse_off
 from snarfcli.formats.plain_meshes import MAX_FACES, parse_obj, parse_stl
 from snarfcli.formats.ply import parse_ply
+from snarfcli.texts import one_line
 
 __all__ = ["SURFACE_SUFFIXES", "list_surfaces", "read_surface"]
 

@@ -11,10 +11,11 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from snarfcli.errors import UserError, one_line
+from snarfcli.errors import UserError
 from snarfcli.formats.pickle_opcodes import read_tree, read_tree_at
 from snarfcli.formats.pickle_tensors import ESTIMATE_NAMES, EstimateReading, value_size
 from snarfcli.formats.pickle_tree import Call, PickleError, shown, text_of
+from snarfcli.texts import one_line
 
 __all__ = ["read_torch", "storage_of"]
 

@@ -10,8 +10,9 @@ import typing
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
-from snarfcli.errors import UserError, nearest, one_line
+from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.schema import group_options, group_schemas, preset_groups, setting_names
+from snarfcli.texts import one_line
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override

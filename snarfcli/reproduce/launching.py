@@ -24,12 +24,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from snarfcli.errors import UserError, one_line
+from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.locks import one_of
 from snarfcli.reproduce.jobs import JobStatus, run_job
 from snarfcli.reproduce.plans import Job
+from snarfcli.texts import one_line
 
 __all__ = ["LAUNCHERS", "Launcher", "check_launcher", "is_installed", "launch", "run_planned_job"]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from snarfcli.errors import UserError, one_line
+from snarfcli.errors import UserError
+from snarfcli.texts import one_line
 from snarfcli.viewer.inputs import on_user
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.state import ViewerState

@@ -86,6 +86,8 @@ class Trainer:
         self.made_up = MadeUpPoses(self.batches.poses())
         self.optimizer = AveragedAdam(self.model, config)
         self.step = 0
+        self.seconds = 0.0
+        """Time that the steps have taken, in all parts of the run."""
 
     def advance(self) -> dict[str, float]:
         """Take one step and return its losses and counts.
@@ -279,6 +281,7 @@ class Trainer:
             "format": CHECKPOINT_FORMAT,
             "version": CHECKPOINT_VERSION,
             "step": self.step,
+            "seconds": self.seconds,
             "seed": self.seed,
             "avatar": self.avatar.to_dict(),
             "training": asdict(self.config),
@@ -311,6 +314,7 @@ class Trainer:
                 self.refiner.restore(state["poses"])
             torch.set_rng_state(state["random"])
             self.step = int(state["step"])
+            self.seconds = float(state.get("seconds", 0.0))
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise UserError(f"{path} does not fit this version ({reason}); start again with overwrite=true") from None

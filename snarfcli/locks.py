@@ -25,7 +25,17 @@ from filelock import FileLock, Timeout
 from snarfcli.errors import UserError
 from snarfcli.texts import one_line
 
-__all__ = ["hold_all_inside", "hold_output", "holder_is_gone", "inherited_locks", "lock_file", "locked", "one_of", "try_lock"]
+__all__ = [
+    "clear_killed",
+    "hold_all_inside",
+    "hold_output",
+    "holder_is_gone",
+    "inherited_locks",
+    "lock_file",
+    "locked",
+    "one_of",
+    "try_lock",
+]
 
 log = logging.getLogger(__name__)
 
@@ -68,6 +78,13 @@ def hold_output(output: str | Path, command: str, *, wait: bool = False) -> Iter
         with suppress(OSError):  # not empty
             for folder in new_folders:
                 folder.rmdir()
+
+
+def clear_killed(output: str | Path) -> None:
+    """Delete the lock of an output whose holder was killed, for commands that then find that there is nothing left to do."""
+    if lock_file(Path(os.path.realpath(output))).exists():
+        with suppress(UserError), hold_output(output, ""):
+            pass
 
 
 def holder_is_gone(output: Path) -> bool:

@@ -280,7 +280,7 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
         log.info("meshes: %s", folder / f"frame_*.{config.format}")
     if config.video:
         log.info("video: %s, its middle frame: %s", folder / VIDEO, POSTER)
-    pieces = sum(frame.components > 1 for frame in frames)
+    pieces = sum((frame.components or 0) > 1 for frame in frames)
     if pieces:
         log.info("%d frames have loose pieces; keep_share=0.1 removes all but large ones", pieces)
     if skipped:

@@ -19,7 +19,7 @@ from snarfcli.export.clips import Clip, on_ground
 from snarfcli.export.export import check_output
 from snarfcli.export.sequence import check_folder, tidy_folder
 from snarfcli.files import atomic_path, read_json, remove_temporaries, write_json
-from snarfcli.locks import hold_output
+from snarfcli.locks import clear_killed, hold_output
 from snarfcli.meshing.mesh_files import MESH_WRITERS
 from snarfcli.names import folder_name, folder_names
 
@@ -60,6 +60,7 @@ def check_place(config: ExportConfig, output: Path) -> Path:
     Raises:
         UserError: it cannot be written.
     """
+    clear_killed(output)
     if config.format in MESH_WRITERS:
         return check_folder(output, config.overwrite)
     suffix = output.suffix.lower().lstrip(".")

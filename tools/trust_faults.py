@@ -10,7 +10,6 @@ exit code 2. The exit code is 1 if something was wrong. Linux only.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import tempfile
 import time
@@ -18,7 +17,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from trust.faults import FAULTS, Bench, build_shim, preloaded_environment
+from trust.faults import FAULTS, Bench, restart_preloaded
 from trust.scenarios import SCENARIOS
 
 
@@ -28,8 +27,7 @@ def main() -> int:
     parser.add_argument("--kind", nargs="+", choices=FAULTS, default=list(FAULTS), help="faults")
     parser.add_argument("--points", type=int, default=40, help="operations per command and kind, evenly spaced")
     options = parser.parse_args()
-    if os.environ.get("FAULTS_READY") != "1":
-        return _start_preloaded()
+    restart_preloaded()
     wrong = 0
     with tempfile.TemporaryDirectory(prefix="snarf-faults-") as folder:
         bench = Bench(Path(folder))
@@ -55,18 +53,6 @@ def _chosen(count: int, points: int, is_slow: bool) -> list[int]:
     """Return evenly spaced numbers of operations from 1 to `count`."""
     points = min(count, max(1, points // 2) if is_slow else points)
     return sorted({1 + round(index * (count - 1) / max(1, points - 1)) for index in range(points)})
-
-
-def _start_preloaded() -> int:
-    """Start this program again, with the library that lets files fail."""
-    with tempfile.TemporaryDirectory(prefix="snarf-shim-") as folder:
-        library = build_shim(Path(folder))
-        if library is None:
-            print("needs Linux and a C compiler", file=sys.stderr)
-            return 2
-        import subprocess
-
-        return subprocess.call([sys.executable, *sys.argv], env=preloaded_environment(library))
 
 
 if __name__ == "__main__":

@@ -10,10 +10,13 @@ import ctypes
 import errno
 import importlib
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import time
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +24,7 @@ from pathlib import Path
 from trust.outputs import content_of, differences
 from trust.scenarios import SCENARIOS, Scenario
 
-__all__ = ["FAULTS", "Bench", "Ended", "build_shim", "preloaded_environment"]
+__all__ = ["FAULTS", "Bench", "Ended", "build_shim", "preloaded_environment", "restart_preloaded"]
 
 KILL = -9
 FAULTS = {"kill": (KILL, False), "full": (errno.ENOSPC, True), "io": (errno.EIO, False)}
@@ -40,6 +43,18 @@ def build_shim(folder: Path) -> Path | None:
     library = folder / "libfaults.so"
     subprocess.run([compiler, "-O1", "-shared", "-fPIC", "-o", str(library), str(_SHIM), "-ldl"], check=True)
     return library
+
+
+def restart_preloaded() -> None:
+    """Start this program again with the library that lets files fail, unless it has it; exit with 2 if that is impossible."""
+    if os.environ.get("FAULTS_READY") == "1":
+        return
+    with tempfile.TemporaryDirectory(prefix="snarf-shim-") as folder:
+        library = build_shim(Path(folder))
+        if library is None:
+            print("needs Linux and a C compiler", file=sys.stderr)
+            sys.exit(2)
+        sys.exit(subprocess.call([sys.executable, *sys.argv], env=preloaded_environment(library)))
 
 
 def preloaded_environment(library: Path) -> dict[str, str]:
@@ -110,21 +125,47 @@ class Bench:
             wrong.append(f"the second run ended with {again.code}: {again.said[-500:]}")
         return wrong + differences(content_of(self.work), expected)
 
+    def pair_problems(self, scenario: Scenario, delay_s: float, *more: str) -> list[str]:
+        """Run a scenario twice at the same time; return what was wrong, one line each.
+
+        Args:
+            scenario: after a call of `operations` with it.
+            delay_s: time between the two starts.
+            more: further arguments of both.
+        """
+        self._start_over(scenario)
+        places = [self.folder / f"said{number}" for number in range(2)]
+        first = self._start(scenario, places[0], more=more)
+        time.sleep(delay_s)
+        second = self._start(scenario, places[1], more=more)
+        wrong = []
+        for number, (process, said) in enumerate(zip((first, second), places, strict=True)):
+            ended = self._end(process, said)
+            refused = ended.code == 2 and re.search(r" is in use by | already; give overwrite=true ", ended.said)
+            if ended.code != 0 and not (refused and len(ended.said.strip().splitlines()) == 1):
+                wrong.append(f"command {number + 1} of 2 ended with {ended.code}: {ended.said[-500:]}")
+        return wrong + differences(content_of(self.work), self._expected[scenario.name])
+
     def run(self, scenario: Scenario, fault: str = "kill", at: int = 0) -> Ended:
         """Run a scenario in a forked process, and wait for it."""
-        counter, said = self.folder / "counter", self.folder / "said"
-        counter.unlink(missing_ok=True)
-        error, lasting = FAULTS[fault]
+        said = self.folder / "said"
+        (self.folder / "counter").unlink(missing_ok=True)
+        return self._end(self._start(scenario, said, fault, at), said)
+
+    def _start(self, scenario: Scenario, said: Path, fault: str = "kill", at: int = 0, more: tuple[str, ...] = ()) -> int:
         process = os.fork()
         if process == 0:
-            self._run_here(scenario, said, counter, at, error, lasting)
+            self._run_here((*scenario.arguments, *more), said, at, *FAULTS[fault])
+        return process
+
+    def _end(self, process: int, said: Path) -> Ended:
         code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
-        number = int.from_bytes(counter.read_bytes()[:8], sys.byteorder)
+        number = int.from_bytes((self.folder / "counter").read_bytes()[:8], sys.byteorder)
         return Ended(code, said.read_text(errors="replace"), number)
 
-    def _run_here(self, scenario: Scenario, said: Path, counter: Path, at: int, error: int, lasting: bool) -> None:
-        """Run the command in this process, and end it."""
-        code = 1
+    def _run_here(self, arguments: tuple[str, ...], said: Path, at: int, error: int, lasting: bool) -> None:
+        """Run a command in this process, and end it."""
+        code, counter = 1, self.folder / "counter"
         try:
             os.chdir(self.work)
             for stream, place in ((1, self.folder / "printed"), (2, said)):
@@ -137,7 +178,7 @@ class Bench:
             self._library.fault_arm(str(self.work).encode(), ctypes.c_long(at), error, int(lasting), str(counter).encode())
             from snarfcli.cli.main import main
 
-            code = main(list(scenario.arguments))
+            code = main(list(arguments))
         except BaseException:
             traceback.print_exc()
         finally:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from snarfcli.errors import UserError
+from snarfcli.names import unique_names
 from snarfcli.texts import one_line
 from snarfcli.viewer.inputs import on_user
 from snarfcli.viewer.picture import Picture
@@ -15,6 +16,7 @@ __all__ = ["NO_MOTION", "MotionTab"]
 
 NO_MOTION = "none"
 _SPEEDS = (0.1, 2.0)
+_LONGEST = 80  # characters of a name in the list
 
 
 class MotionTab:
@@ -38,10 +40,13 @@ class MotionTab:
     ) -> None:
         self._state = state
         self._load_motion = load_motion
+        shown = [one_line(name, _LONGEST) or "unnamed" for name in motions]  # names come from files
+        self._names = dict(zip(unique_names([NO_MOTION, *shown])[1:], motions, strict=True))
         self._is_playing: bool | None = None
         self.notice: str | None = None
         """Why the chosen motion cannot be played, in one line; None if it can."""
-        self.names = gui.add_dropdown("Motion", (NO_MOTION, *motions), initial_value=first or NO_MOTION)
+        start = next((label for label, name in self._names.items() if name == first), NO_MOTION)
+        self.names = gui.add_dropdown("Motion", (NO_MOTION, *self._names), initial_value=start)
         self._play = gui.add_button("Play", icon="player-play")
         self._frame = gui.add_slider("Frame", 0, 1, 1, 0)
         speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="1 is the original speed")
@@ -58,10 +63,10 @@ class MotionTab:
         self._fit_frames()
 
     def choose(self, name: str) -> None:
-        """Load and play the motion with this name."""
+        """Load and play the motion with this name in the list."""
         self.notice = None
         try:
-            motion, transforms = (None, None) if name == NO_MOTION else self._load_motion(name)
+            motion, transforms = (None, None) if name == NO_MOTION else self._load_motion(self._names[name])
         except UserError as error:
             self.notice = one_line(error)
             motion, transforms = None, None

@@ -106,7 +106,11 @@ class Page:
 
     def send(self, message: dict[str, Any]) -> None:
         """Send any message."""
-        self._socket.send(msgspec.msgpack.encode(message))
+        self.send_bytes(msgspec.msgpack.encode(message))
+
+    def send_bytes(self, data: bytes | str) -> None:
+        """Send any data, text as a message of text."""
+        self._socket.send(data)
 
     def _send(self, message: _messages.Message) -> None:
         self.send(message.as_serializable_dict([]))

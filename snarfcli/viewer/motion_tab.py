@@ -8,7 +8,7 @@ from typing import Any
 from snarfcli.errors import UserError
 from snarfcli.names import unique_names
 from snarfcli.texts import one_line
-from snarfcli.viewer.inputs import on_user
+from snarfcli.viewer.inputs import Inputs
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.state import ViewerState
 
@@ -23,7 +23,7 @@ class MotionTab:
     """The inputs of the motion, added to the current container of viser.
 
     Args:
-        gui: GUI of viser.
+        inputs: makes the inputs.
         state: state of the viewer.
         motions: names of the motions that can be played.
         load_motion: returns the motion of a name and its bone transforms; raises UserError.
@@ -32,7 +32,7 @@ class MotionTab:
 
     def __init__(
         self,
-        gui: Any,
+        inputs: Inputs,
         state: ViewerState,
         motions: Sequence[str],
         load_motion: Callable[[str], tuple[Any, Any]],
@@ -46,20 +46,19 @@ class MotionTab:
         self.notice: str | None = None
         """Why the chosen motion cannot be played, in one line; None if it can."""
         start = next((label for label, name in self._names.items() if name == first), NO_MOTION)
-        self.names = gui.add_dropdown("Motion", (NO_MOTION, *self._names), initial_value=start)
-        self._play = gui.add_button("Play", icon="player-play")
-        self._frame = gui.add_slider("Frame", 0, 1, 1, 0)
-        speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="1 is the original speed")
-        loop = gui.add_checkbox("Loop", state.player.is_looping)
-        in_place = gui.add_checkbox(
+        self.names = inputs.add_dropdown("Motion", (NO_MOTION, *self._names), start)
+        self._play = inputs.add_button("Play", lambda client: self._play_or_pause(), icon="player-play")
+        self._frame = inputs.add_slider("Frame", 0, 1, 1, 0)
+        speed = inputs.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="1 is the original speed")
+        loop = inputs.add_checkbox("Loop", state.player.is_looping)
+        in_place = inputs.add_checkbox(
             "Stay in place", state.look.is_in_place, hint="the body keeps its height, but does not travel"
         )
-        on_user(self.names, lambda handle, client: self.choose(handle.value))
-        self._play.on_click(lambda event: self._play_or_pause())
-        on_user(self._frame, lambda handle, client: self._seek(handle.value))
-        on_user(speed, lambda handle, client: state.change_speed(handle.value))
-        on_user(loop, lambda handle, client: state.change_looping(handle.value))
-        on_user(in_place, lambda handle, client: state.change_look(is_in_place=handle.value))
+        inputs.on_user(self.names, self.choose)
+        inputs.on_user(self._frame, self._seek)
+        inputs.on_user(speed, state.change_speed)
+        inputs.on_user(loop, state.change_looping)
+        inputs.on_user(in_place, lambda value: state.change_look(is_in_place=value))
         self._fit_frames()
 
     def choose(self, name: str) -> None:

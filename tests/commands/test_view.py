@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import socket
 import sys
 import urllib.request
 from dataclasses import replace
@@ -133,10 +134,12 @@ def test_no_browser_if_not_wanted(served, opened):
 def test_who_listens_to_all_is_warned(served, opened, caplog):
     with caplog.at_level(logging.WARNING):
         server = served(host="0.0.0.0")
-    assert [record.message for record in caplog.records] == [
-        "host=0.0.0.0: all machines in the network can see and change the page"
-    ]
-    assert opened == [f"http://127.0.0.1:{server.port}"]
+    (record,) = caplog.records
+    assert record.message.startswith("host=0.0.0.0: whoever knows this address, with its token, can see and change the page")
+    assert record.message.endswith(f"http://{socket.gethostname()}:{server.port}")
+    assert server.access.token
+    assert server.access.token not in caplog.text
+    assert opened == [f"http://127.0.0.1:{server.port}/?token={server.access.token}"]
 
 
 def test_pose_files_are_on_the_shelf_and_the_first_one_plays(served):

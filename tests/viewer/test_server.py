@@ -21,7 +21,7 @@ from snarfcli.errors import UserError
 from snarfcli.motions import Motion
 from snarfcli.viewer import server as server_module
 from snarfcli.viewer.joints import angles_of
-from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback
+from snarfcli.viewer.server import ViewServer, can_open_browser, check_port
 from snarfcli.viewer.state import ViewerState
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
@@ -286,12 +286,3 @@ def test_a_stopped_server_leaves_its_port():
 )
 def test_a_browser_is_opened_only_where_it_is_seen(environment, platform, can):
     assert can_open_browser(environment, platform) is can
-
-
-def test_loopback():
-    assert is_loopback("127.0.0.1")
-    assert is_loopback("localhost")
-    assert is_loopback("::1")
-    assert not is_loopback("0.0.0.0")
-    assert not is_loopback("192.168.0.2")
-    assert not is_loopback("example.org")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import socket
+import sys
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from omegaconf import MISSING
 
@@ -34,6 +36,9 @@ from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, req
 __all__ = ["ViewConfig", "run", "start"]
 
 log = logging.getLogger(__name__)
+
+_PATIENCE_S = 0.5  # for a surface that is being computed when Ctrl-C is pressed
+_EXIT_INTERRUPTED = 130
 
 
 @dataclass
@@ -70,9 +75,24 @@ def run(config: ViewConfig) -> int:
     server = start(config)
     try:
         server.wait()
-    finally:
-        server.stop()
+    except KeyboardInterrupt:
+        if not server.stop(_PATIENCE_S):
+            _leave()
+        raise
+    server.stop()
     return 0
+
+
+def _leave() -> NoReturn:
+    """End the process at once, as after Ctrl-C, without the exit of Python, which waits for its threads or aborts in them.
+
+    Nothing is lost: the viewer writes no files.
+    """
+    print("snarf view: interrupted", file=sys.stderr)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(_EXIT_INTERRUPTED)
 
 
 def start(config: ViewConfig) -> ViewServer:
@@ -196,11 +216,10 @@ def _announce(config: ViewConfig, avatar: Avatar, path: Path, server: ViewServer
     log.info("avatar: %s, on %s", path, avatar.device)
     log.info("page: %s (Ctrl-C ends the server)", server.address)
     if not is_loopback(config.host):
-        log.warning(
-            "host=%s: whoever knows this address, with its token, can see and change the page, from all machines in the network; "
-            "there the address begins with http://%s:%d",
-            config.host, socket.gethostname(), port,
-        )  # fmt: skip
+        message = (
+            "host=%s: whoever knows this address, with its token, can see and change the page; elsewhere it begins with %s"
+        )
+        log.warning(message, config.host, f"http://{socket.gethostname()}:{port}")
     if config.open and can_open_browser():
         webbrowser.open(server.address)
     elif is_loopback(config.host) and (os.environ.get("SSH_CONNECTION") or not can_open_browser()):

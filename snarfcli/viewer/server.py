@@ -29,6 +29,7 @@ __all__ = ["ViewServer", "can_open_browser", "check_port", "require_viser"]
 log = logging.getLogger(__name__)
 
 _TRIED_PORTS = 100
+_PATIENCE_S = 60.0
 _SHORTEST_S = 1 / 60  # minimum time between two pictures
 
 
@@ -166,13 +167,23 @@ class ViewServer:
         """The address of the page, with its token if it needs one."""
         return self.access.address(self.port)
 
-    def stop(self) -> None:
-        """Stop the server and the threads."""
+    def stop(self, patience_s: float = _PATIENCE_S) -> bool:
+        """Stop the server and the threads.
+
+        Args:
+            patience_s: time to wait for the threads, one of which may be computing a surface for minutes.
+
+        Returns:
+            Whether all threads have ended. Otherwise Python must not exit as usual: it would wait for the threads that load
+            motions, and abort in those that run native code.
+        """
+        deadline = time.monotonic() + patience_s
         self._is_stopped = True
         self._woken.set()
-        self._thread.join(timeout=10)
-        self.state.stop()
+        self._thread.join(timeout=patience_s)
+        has_ended = self.state.stop(max(deadline - time.monotonic(), 0.0))
         self._stop_server()
+        return has_ended and not self._thread.is_alive() and self.gate.is_idle
 
     def _forget_client(self, client_id: int) -> None:
         self.scene.let_go(client_id)

@@ -153,9 +153,9 @@ class ViewerState:
                 self._go_to(self._frame)
             self._wake()
 
-    def stop(self) -> None:
-        """Stop computing surfaces."""
-        self._worker.stop()
+    def stop(self, patience_s: float) -> bool:
+        """Request no more surfaces; return whether the one that is being computed has ended within `patience_s`."""
+        return self._worker.stop(patience_s)
 
     # ---------------------------------------------------------------- the picture
     def picture(self) -> tuple[Picture, float | None]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import socket
+import subprocess
 import sys
 import urllib.request
 from dataclasses import replace
@@ -181,12 +184,58 @@ def test_ctrl_c_stops_the_server(config, monkeypatch, capsys):
         ports.append(server.port)
         raise KeyboardInterrupt
 
+    monkeypatch.setattr(view, "_PATIENCE_S", 300.0)  # the first surface is computed on any machine
+
     monkeypatch.setattr(ViewServer, "wait", interrupted)
     assert main(["view", "--port", "auto", "--no-open", "--pose", pose_file("wave.npz"), "up=y", "resolution=24"]) == 130
     assert "snarf view: interrupted" in capsys.readouterr().err
     check_port("127.0.0.1", ports[0])
     monkeypatch.setattr(ViewServer, "wait", lambda server: None)
     assert run(config) == 0
+
+
+ENDLESS = """
+import sys
+from types import SimpleNamespace
+
+import torch
+from toy_avatar import ToyAvatar
+
+from snarfcli.avatar import Avatar
+from snarfcli.cli.main import main
+
+
+class Endless(ToyAvatar):
+    def canonical_logits(self, points_c, pose):
+        print("computing", flush=True)
+        while True:
+            torch.ones(10**6).sum()  # native code
+
+
+avatar = Endless()
+avatar.config = SimpleNamespace(model=SimpleNamespace(name="capsules"), condition=SimpleNamespace(name="none"))
+Avatar.load = classmethod(lambda cls, path, device: avatar)
+sys.exit(main(["view", "--no-open", "ckpt=toy.pt", "data=meshes", "subject=a"]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for one process")
+def test_ctrl_c_ends_the_process_while_a_surface_is_computed(tmp_path):
+    (tmp_path / "toy.pt").write_bytes(b"the toy")
+    child = subprocess.Popen(
+        [sys.executable, "-c", ENDLESS], cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )  # fmt: skip
+    lines: list[str] = []
+    try:
+        while not any("Ctrl-C" in line for line in lines) or "computing\n" not in lines:
+            lines.append(child.stdout.readline())
+            assert lines[-1], child.stderr.read()
+        child.send_signal(signal.SIGINT)
+        _, errors = child.communicate(timeout=300)
+    finally:
+        child.kill()
+    assert (child.returncode, errors) == (130, "snarf view: interrupted\n")
 
 
 def test_without_viser_one_line_before_any_work(config, monkeypatch, capsys):

@@ -27,7 +27,7 @@ def server():
 def watched():
     watched = Watched()
     yield watched
-    watched.state.stop()
+    watched.state.stop(PATIENCE_S)
 
 
 @pytest.fixture

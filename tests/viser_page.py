@@ -10,12 +10,13 @@ from typing import Any
 import msgspec
 import viser
 import zstandard
+from typing_extensions import Self
 from viser import _messages
 from websockets.sync.client import ClientConnection, connect
 
 from snarfcli.viewer.server import ViewServer
 
-__all__ = ["Page", "open_socket"]
+__all__ = ["Client", "Page", "open_socket"]
 
 PATIENCE_S = 300  # only a broken test waits that long, however busy the machine is
 
@@ -26,26 +27,22 @@ def open_socket(port: int, headers: dict[str, str] | None = None, **changes: Any
     return connect(f"ws://127.0.0.1:{port}", additional_headers=headers, max_size=None, open_timeout=PATIENCE_S, **options)
 
 
-class Page:
-    """One client of the viewer on this machine.
+class Client:
+    """One client of a viewer at a port of this machine.
 
     Args:
-        server: the viewer.
+        port: port of the viewer.
         headers: further headers of the handshake.
     """
 
-    def __init__(self, server: ViewServer, headers: dict[str, str] | None = None) -> None:
-        known, came = set(server.server.get_clients()), queue.Queue()
-        server.server.on_client_connect(lambda client: came.put(client.client_id))
-        self._socket = open_socket(server.port, headers)
+    def __init__(self, port: int, headers: dict[str, str] | None = None) -> None:
+        self._socket = open_socket(port, headers)
         self.messages: list[dict[str, Any]] = []
         self._mark = 0
         self._send(_messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 3), 0.8, 0.1, 100, 480, 640, (0, 0, 0), (0, 1, 0)))
         self.until(lambda message: message["type"] == "ReplayDoneMessage")
-        while came.get(timeout=PATIENCE_S) in known:  # before that the server does not listen
-            pass
 
-    def __enter__(self) -> Page:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -114,6 +111,17 @@ class Page:
 
     def _send(self, message: _messages.Message) -> None:
         self.send(message.as_serializable_dict([]))
+
+
+class Page(Client):
+    """A client of a viewer in this process, which listens to it from the beginning."""
+
+    def __init__(self, server: ViewServer, headers: dict[str, str] | None = None) -> None:
+        known, came = set(server.server.get_clients()), queue.Queue()
+        server.server.on_client_connect(lambda client: came.put(client.client_id))
+        super().__init__(server.port, headers)
+        while came.get(timeout=PATIENCE_S) in known:  # before that the server does not listen
+            pass
 
 
 def _labels(message: dict[str, Any]) -> set[str]:

@@ -39,11 +39,18 @@ _KEY = "dGhlIHNhbXBsZSBub25jZQ=="  # any 16 bytes (RFC 6455, section 1.3)
 
 
 class Door:
-    """Lets in the clients that `access` accepts, a limited number of them, and the messages that `gate` admits."""
+    """Lets in the clients that `access` accepts, a limited number of them, and the messages that `gate` admits.
 
-    def __init__(self, access: Access, gate: Gate) -> None:
+    Args:
+        access: rules for connections.
+        gate: rules for messages.
+        left: called when a client has left.
+    """
+
+    def __init__(self, access: Access, gate: Gate, left: Callable[[], None]) -> None:
         self._access = access
         self._gate = gate
+        self._left = left
         self._clients = 0
         # Of its own and silent, since websockets logs each refused or broken handshake as an error with its trace.
         self._log = logging.getLogger(f"{__name__}.connections")
@@ -133,6 +140,7 @@ class Door:
             await handle(connection)
         finally:
             self._clients -= 1
+            self._left()
 
     async def _receive(self, receive: Callable[[], Awaitable[Any]], pace: _Pace) -> Any:
         """Return the next message that the gate admits. While the viewer is busy, the client waits: nothing is queued."""

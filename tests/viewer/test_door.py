@@ -132,7 +132,7 @@ def test_an_unprotected_server_is_not_shown(monkeypatch):
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
         with pytest.raises(UserError, match="could not test its protection"):
-            Door(Access("127.0.0.1"), Gate()).verify("127.0.0.1", nobody.getsockname()[1])
+            Door(Access("127.0.0.1"), Gate(), lambda: None).verify("127.0.0.1", nobody.getsockname()[1])
 
 
 def test_more_clients_than_allowed_are_sent_away_until_one_leaves(server):

@@ -67,7 +67,7 @@ def run(config: ViewConfig) -> int:
     """Serve the page until Ctrl-C.
 
     Returns:
-        0 if the server ends by itself; Ctrl-C raises KeyboardInterrupt, which ends the command with 130.
+        0 if the server ends by itself; Ctrl-C ends the process with exit code 130.
 
     Raises:
         UserError: viser is not installed, the avatar or a motion does not exist, or the port is in use.
@@ -76,17 +76,16 @@ def run(config: ViewConfig) -> int:
     try:
         server.wait()
     except KeyboardInterrupt:
-        if not server.stop(_PATIENCE_S):
-            _leave()
-        raise
+        server.stop(_PATIENCE_S)
+        _leave()
     server.stop()
     return 0
 
 
 def _leave() -> NoReturn:
-    """End the process at once, as after Ctrl-C, without the exit of Python, which waits for its threads or aborts in them.
+    """End the process as after Ctrl-C, but at once: the exit of Python waits for threads, or aborts in their native code.
 
-    Nothing is lost: the viewer writes no files.
+    Nothing is lost, since the viewer writes no files.
     """
     print("snarf view: interrupted", file=sys.stderr)
     for stream in (sys.stdout, sys.stderr):

@@ -141,11 +141,6 @@ class Gate:
         """Whether so many messages are being reacted to that further ones must wait."""
         return self._reactions >= _BUSY
 
-    @property
-    def is_idle(self) -> bool:
-        """Whether no message is being reacted to."""
-        return self._reactions == 0
-
     def reaction(self, react: Callable[[Any], Any]) -> Callable[[Any], None]:
         """Return `react` as a callback for viser, which would print a trace for each exception."""
 

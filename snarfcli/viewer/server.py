@@ -169,25 +169,21 @@ class ViewServer:
         """The address of the page, with its token if it needs one."""
         return self.access.address(self.port)
 
-    def stop(self, patience_s: float = _PATIENCE_S) -> bool:
+    def stop(self, patience_s: float = _PATIENCE_S) -> None:
         """Stop the server and the threads.
 
         Args:
             patience_s: time to wait for the threads: one may compute a surface for minutes, and viser waits for its clients.
-
-        Returns:
-            Whether all threads have ended. Otherwise Python must not exit as usual: it would wait for the threads that load
-            motions, and abort in those that run native code.
+                Python cannot exit as usual before they have ended, since it would abort in those that run native code.
         """
         deadline = time.monotonic() + patience_s
         self._is_stopped = True
         self._woken.set()
-        ending = threading.Thread(target=self._stop_server, name="snarf-view-end", daemon=True)
         self._thread.join(timeout=patience_s)
-        has_ended = self.state.stop(max(deadline - time.monotonic(), 0.0))
+        ending = threading.Thread(target=self._stop_server, name="snarf-view-end", daemon=True)
         ending.start()
+        self.state.stop(max(deadline - time.monotonic(), 0.0))
         ending.join(timeout=max(deadline - time.monotonic(), 0.0))
-        return has_ended and self.gate.is_idle and not (self._thread.is_alive() or ending.is_alive())
 
     def _count_leaver(self) -> None:
         self._has_garbage = True

@@ -44,13 +44,12 @@ class BackgroundWorker:
             outcome, self._outcome = self._outcome, None
             return outcome
 
-    def stop(self, patience_s: float) -> bool:
-        """Accept no more requests, and wait for the running one; return whether it has ended within `patience_s`."""
+    def stop(self, patience_s: float) -> None:
+        """Accept no more requests, and wait for the running one, at most `patience_s`."""
         with self._changed:
             self._is_stopped = True
             self._changed.notify_all()
         self._thread.join(timeout=patience_s)
-        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while True:

@@ -184,10 +184,15 @@ def test_ctrl_c_stops_the_server(config, monkeypatch, capsys):
         ports.append(server.port)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(view, "_PATIENCE_S", 300.0)  # the first surface is computed on any machine
+    def leave(code: int) -> None:
+        raise SystemExit(code)
 
     monkeypatch.setattr(ViewServer, "wait", interrupted)
-    assert main(["view", "--port", "auto", "--no-open", "--pose", pose_file("wave.npz"), "up=y", "resolution=24"]) == 130
+    monkeypatch.setattr(view.os, "_exit", leave)
+    monkeypatch.setattr(view, "_PATIENCE_S", 300.0)  # the first surface is computed on any machine
+    with pytest.raises(SystemExit) as left:
+        main(["view", "--port", "auto", "--no-open", "--pose", pose_file("wave.npz"), "up=y", "resolution=24"])
+    assert left.value.code == 130
     assert "snarf view: interrupted" in capsys.readouterr().err
     check_port("127.0.0.1", ports[0])
     monkeypatch.setattr(ViewServer, "wait", lambda server: None)

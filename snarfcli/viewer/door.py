@@ -100,31 +100,30 @@ class Door:
 
     def _answer(self, answer: Callable[[Any, Any], Any] | None, connection: Any, request: Any) -> Any:
         """Answer a request: refuse it, redirect it, serve the page, or return None to begin a WebSocket."""
-        port = connection.local_address[1]
-        headers = request.headers
+        headers, port = request.headers, connection.local_address[1]
         asked = Request(request.path, port, *(headers.get_all(name) for name in ("Host", "Origin", "Cookie")))
         reason = self._access.refusal(asked)
-        if reason is None and len(asked.origins) > 1:
-            reason = "more than one origin"
         if reason is not None:
             return self._refuse(connection, reason)
-        if (
-            "?" in request.path
-        ):  # to the same page without the token in its address, and without viser's parameters: one names another server
-            response = connection.respond(http.HTTPStatus.SEE_OTHER, "")
-            response.headers["Location"] = "/"
-            cookie = self._access.cookie(port)
-            if cookie is not None:
-                response.headers["Set-Cookie"] = cookie
-            return response
-        response = None if answer is None else answer(connection, request)
-        if response is not None:
+        if "?" in request.path:
+            return self._redirect(connection, port)
+        page = None if answer is None else answer(connection, request)
+        if page is not None:
             for name, value in PAGE_HEADERS.items():
-                response.headers[name] = value
-            return response
+                page.headers[name] = value
+            return page
         if not asked.origins:
             return self._refuse(connection, "wanted the origin of the page")
-        return self._refuse(connection, "wanted viser's protocol") if not _is_viser(headers) else None
+        return None if _is_viser(headers) else self._refuse(connection, "wanted viser's protocol")
+
+    def _redirect(self, connection: Any, port: int) -> Any:
+        """Lead to the page without parameters: the token moves to the cookie, and viser has one that names another server."""
+        response = connection.respond(http.HTTPStatus.SEE_OTHER, "")
+        response.headers["Location"] = "/"
+        cookie = self._access.cookie(port)
+        if cookie is not None:
+            response.headers["Set-Cookie"] = cookie
+        return response
 
     def _refuse(self, connection: Any, reason: str) -> Any:
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"snarf view: {reason}\n")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import socket
 import sys
 import webbrowser
@@ -37,7 +38,6 @@ __all__ = ["ViewConfig", "run", "start"]
 
 log = logging.getLogger(__name__)
 
-_PATIENCE_S = 0.5  # for a surface that is being computed when Ctrl-C is pressed
 _EXIT_INTERRUPTED = 130
 
 
@@ -72,11 +72,10 @@ def run(config: ViewConfig) -> int:
     Raises:
         UserError: viser is not installed, the avatar or a motion does not exist, or the port is in use.
     """
-    server = start(config)
     try:
+        server = start(config)
         server.wait()
     except KeyboardInterrupt:
-        server.stop(_PATIENCE_S)
         _leave()
     server.stop()
     return 0
@@ -87,6 +86,8 @@ def _leave() -> NoReturn:
 
     Nothing is lost, since the viewer writes no files.
     """
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # pressed twice
     print("snarf view: interrupted", file=sys.stderr)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):

@@ -30,6 +30,7 @@ class Inputs:
     def __init__(self, gui: Any, gate: Gate) -> None:
         self._gui = gui
         self._gate = gate
+        self._chosen: dict[str, Any] = {}  # the latest value that a client chose for each input
 
     def add_dropdown(self, label: str, options: Sequence[str], value: str, **more: Any) -> Any:
         """Add a list of options."""
@@ -41,7 +42,9 @@ class Inputs:
         handle = self._gui.add_slider(label, low, high, step, value, **more)
         is_whole = all(isinstance(number, int) for number in (low, high, step, value))
         return self._accept(
-            handle, lambda value: is_number(value, handle.min, handle.max) and (not is_whole or value == int(value))
+            handle,
+            lambda value: is_number(value, handle.min, handle.max) and (not is_whole or value == int(value)),
+            int if is_whole else float,
         )
 
     def add_checkbox(self, label: str, value: bool, **more: Any) -> Any:
@@ -51,7 +54,11 @@ class Inputs:
     def add_rgb(self, label: str, value: tuple[int, int, int], **more: Any) -> Any:
         """Add a choice of a colour, sRGB."""
         handle = self._gui.add_rgb(label, value, **more)
-        return self._accept(handle, lambda value: is_vector(value, 3) and all(0 <= part <= 255 for part in value))
+        return self._accept(
+            handle,
+            lambda value: is_vector(value, 3) and all(0 <= part <= 255 for part in value),
+            lambda value: tuple(int(part) for part in value),
+        )
 
     def add_button(self, label: str, react: Callable[[Any], Any], **more: Any) -> Any:
         """Add a button; `react` gets the client."""
@@ -62,7 +69,7 @@ class Inputs:
     def add_buttons(self, options: Sequence[str], react: Callable[[str], Any], **more: Any) -> Any:
         """Add a row of buttons; `react` gets the pressed one."""
         handle = self._gui.add_button_group("", tuple(options), **more)
-        handle.on_click(self._gate.reaction(lambda event: react(event.target.value)))
+        handle.on_click(self._gate.reaction(lambda event: react(self._chosen[handle._impl.uuid])))
         return self._accept(handle, lambda value: isinstance(value, str) and value in handle.options)
 
     def add_folder(self, label: str, **more: Any) -> Any:
@@ -70,14 +77,17 @@ class Inputs:
         return self._gui.add_folder(label, **more)
 
     def on_user(self, handle: Any, react: Callable[[Any], Any]) -> None:
-        """Call `react` with the value that a user chooses, but not when the program sets it."""
-        handle.on_update(self._gate.reaction(lambda event: event.client and react(event.target.value)))
+        """Call `react` with the value that a user chooses, but not when the program sets it, which may happen meanwhile."""
+        handle.on_update(self._gate.reaction(lambda event: event.client and react(self._chosen[handle._impl.uuid])))
 
-    def _accept(self, handle: Any, offers: Check) -> Any:
-        """Let clients set an input to the values that it offers."""
+    def _accept(self, handle: Any, offers: Check, convert: Callable[[Any], Any] = lambda value: value) -> Any:
+        """Let clients set an input to the values that it offers, which `convert` gives their type."""
 
         def accepts(value: object) -> bool:
-            return handle.visible and not handle.disabled and offers(value)
+            is_offered = handle.visible and not handle.disabled and offers(value)
+            if is_offered:
+                self._chosen[handle._impl.uuid] = convert(value)
+            return is_offered
 
         def show_again() -> None:
             handle._queue_update("value", handle.value)  # an assignment is not sent where nothing changes

@@ -101,4 +101,4 @@ class MotionTab:
     def _seek(self, frame: int) -> None:
         if self._state.motion is not None:
             self._state.pause()
-            self._state.seek(int(frame))
+            self._state.seek(frame)

@@ -30,7 +30,6 @@ __all__ = ["ViewServer", "can_open_browser", "check_port", "require_viser"]
 log = logging.getLogger(__name__)
 
 _TRIED_PORTS = 100
-_PATIENCE_S = 60.0
 _SHORTEST_S = 1 / 60  # minimum time between two pictures
 
 
@@ -169,21 +168,13 @@ class ViewServer:
         """The address of the page, with its token if it needs one."""
         return self.access.address(self.port)
 
-    def stop(self, patience_s: float = _PATIENCE_S) -> None:
-        """Stop the server and the threads.
-
-        Args:
-            patience_s: time to wait for the threads: one may compute a surface for minutes, and viser waits for its clients.
-                Python cannot exit as usual before they have ended, since it would abort in those that run native code.
-        """
-        deadline = time.monotonic() + patience_s
+    def stop(self) -> None:
+        """Stop the server and the threads, which may take as long as the surface that is being computed."""
         self._is_stopped = True
         self._woken.set()
-        self._thread.join(timeout=patience_s)
-        ending = threading.Thread(target=self._stop_server, name="snarf-view-end", daemon=True)
-        ending.start()
-        self.state.stop(max(deadline - time.monotonic(), 0.0))
-        ending.join(timeout=max(deadline - time.monotonic(), 0.0))
+        self._thread.join(timeout=10)
+        self.state.stop()
+        self._stop_server()
 
     def _count_leaver(self) -> None:
         self._has_garbage = True

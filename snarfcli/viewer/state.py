@@ -153,9 +153,9 @@ class ViewerState:
                 self._go_to(self._frame)
             self._wake()
 
-    def stop(self, patience_s: float) -> None:
-        """Compute no more surfaces, and wait for the one that is being computed, at most `patience_s`."""
-        self._worker.stop(patience_s)
+    def stop(self) -> None:
+        """Stop computing surfaces."""
+        self._worker.stop()
 
     # ---------------------------------------------------------------- the picture
     def picture(self) -> tuple[Picture, float | None]:

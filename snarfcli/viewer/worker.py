@@ -44,8 +44,8 @@ class BackgroundWorker:
             outcome, self._outcome = self._outcome, None
             return outcome
 
-    def stop(self, patience_s: float) -> None:
-        """Accept no more requests, and wait for the running one, at most `patience_s`."""
+    def stop(self, patience_s: float = 60.0) -> None:
+        """Accept no more requests, and wait for the running one: the process would abort if it exited during native code."""
         with self._changed:
             self._is_stopped = True
             self._changed.notify_all()

@@ -17,6 +17,7 @@ from snarfcli.motions import Motion
 from snarfcli.viewer.access import Access
 from snarfcli.viewer.door import MAX_CLIENTS, Door
 from snarfcli.viewer.gate import Gate
+from snarfcli.viewer.inputs import Inputs
 from snarfcli.viewer.server import ViewServer
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
@@ -202,6 +203,25 @@ def test_a_huge_message_ends_only_the_connection_that_sent_it(server, capfd):
             page.until(lambda message: False)
         other.until_text("vertices")
     assert "Traceback" not in "".join(capfd.readouterr())
+
+
+def test_a_value_counts_as_chosen_also_if_the_program_sets_another_meanwhile(server):
+    class Event:
+        def __init__(self, handle) -> None:
+            self.client, self.target = "a client", handle
+
+    chosen = []
+    inputs = Inputs(server.server.gui, server.gate)
+    slider = inputs.add_slider("test", 0, 9, 1, 5)
+    try:
+        inputs.on_user(slider, chosen.append)
+        assert server.gate._inputs[slider._impl.uuid].accepts(7.0)
+        slider.value = 3
+        slider._impl.update_cb[-1](Event(slider))
+        assert chosen == [7]
+    finally:
+        slider.remove()
+        server.gate._inputs.pop(slider._impl.uuid)
 
 
 def test_every_input_refuses_what_it_does_not_offer(server):

@@ -27,7 +27,7 @@ def server():
 def watched():
     watched = Watched()
     yield watched
-    watched.state.stop(PATIENCE_S)
+    watched.state.stop()
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ BEND = np.array([0.0, 0.0, 0.9])
 def watched():
     watched = Watched()
     yield watched
-    watched.state.stop(PATIENCE_S)
+    watched.state.stop()
 
 
 def bending(frames: int = 4, rate: float = 10.0) -> Motion:
@@ -154,7 +154,7 @@ def test_an_avatar_without_any_surface_is_told_too():
     picture = watched.settled()
     assert picture.mesh is None
     assert picture.message
-    watched.state.stop(PATIENCE_S)
+    watched.state.stop()
 
 
 def test_an_avatar_without_weights_shows_its_field_only():
@@ -170,7 +170,7 @@ def test_an_avatar_without_weights_shows_its_field_only():
     assert meanwhile.is_computing
     assert meanwhile.mesh.posed is first.mesh.posed
     assert watched.settled().mesh.posed.pose[1, 2] == 0.9
-    watched.state.stop(PATIENCE_S)
+    watched.state.stop()
 
 
 def test_a_motion_plays_and_a_changed_pose_holds_it(watched):

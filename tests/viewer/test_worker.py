@@ -36,7 +36,7 @@ def test_one_thing_at_a_time_and_nothing_queued(idle):
     assert worker.start(4)
     assert idle.wait(PATIENCE_S)
     assert worker.take() == (4, 8, None)
-    worker.stop(PATIENCE_S)
+    worker.stop()
     assert not worker.start(5)
 
 
@@ -49,22 +49,4 @@ def test_an_error_is_handed_over(idle):
     assert idle.wait(PATIENCE_S)
     request, result, error = worker.take()
     assert (request, result, str(error)) == ("it", None, "no surface")
-    worker.stop(PATIENCE_S)
-
-
-def test_who_stops_can_leave_before_the_work_ends():
-    go_on, begun = threading.Event(), threading.Event()
-
-    def work(request):
-        begun.set()
-        assert go_on.wait(PATIENCE_S)
-
-    worker = BackgroundWorker(work, lambda: None)
-    worker.start("it")
-    assert begun.wait(PATIENCE_S)
-    worker.stop(0.0)
-    assert not go_on.is_set()
-    assert not worker.start("another")
-    go_on.set()
-    worker.stop(PATIENCE_S)
-    assert worker.take() is not None
+    worker.stop()

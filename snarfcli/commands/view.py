@@ -25,6 +25,7 @@ from snarfcli.commands.selection import (
     select_motion,
 )
 from snarfcli.errors import UserError
+from snarfcli.interrupts import exit_code
 from snarfcli.meshing.posed import RESOLUTIONS
 from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL, layout_of
@@ -37,8 +38,6 @@ from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, req
 __all__ = ["ViewConfig", "run", "start"]
 
 log = logging.getLogger(__name__)
-
-_EXIT_INTERRUPTED = 130
 
 
 @dataclass
@@ -67,7 +66,7 @@ def run(config: ViewConfig) -> int:
     """Serve the page until Ctrl-C.
 
     Returns:
-        0 if the server ends by itself; Ctrl-C ends the process with exit code 130.
+        0 if the server ends by itself; Ctrl-C and the signals that end commands end the process, with their exit codes.
 
     Raises:
         UserError: viser is not installed, the avatar or a motion does not exist, or the port is in use.
@@ -75,24 +74,23 @@ def run(config: ViewConfig) -> int:
     try:
         server = start(config)
         server.wait()
-    except KeyboardInterrupt:
-        _leave()
+    except KeyboardInterrupt as interrupt:
+        _leave(exit_code(interrupt))
     server.stop()
     return 0
 
 
-def _leave() -> NoReturn:
+def _leave(code: int) -> NoReturn:
     """End the process as after Ctrl-C, but at once: the exit of Python waits for threads, or aborts in their native code.
 
     Nothing is lost, since the viewer writes no files.
     """
     with contextlib.suppress(ValueError):  # not in the main thread
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # pressed twice
-    print("snarf view: interrupted", file=sys.stderr)
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(_EXIT_INTERRUPTED)
+    with contextlib.suppress(OSError, ValueError):  # a closed terminal
+        print("snarf view: interrupted", file=sys.stderr, flush=True)
+        sys.stdout.flush()
+    os._exit(code)
 
 
 def start(config: ViewConfig) -> ViewServer:

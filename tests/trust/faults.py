@@ -113,10 +113,11 @@ class Bench:
         expected = self._expected[scenario.name]
         first = self.run(scenario, fault, at)
         wrong = []
-        if first.code not in _ALLOWED_CODES[fault]:
+        is_reported = scenario.is_slow and first.code == 1  # a command that it had started failed, as its tables say
+        if first.code not in _ALLOWED_CODES[fault] and not is_reported:
             wrong.append(f"exit code {first.code}: {first.said[-500:]}")
         lines = [line for line in first.said.splitlines() if line.strip()]
-        if first.code > 0 and len(lines) != 1:
+        if first.code > 0 and not is_reported and len(lines) != 1:
             wrong.append(f"wanted one line, got {len(lines)}: {first.said[-1000:]}")
         there = content_of(self.work)
         is_done = not differences({name: one for name, one in there.items() if name in expected}, expected)

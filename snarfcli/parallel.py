@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from snarfcli.errors import UserError
+from snarfcli.safe_start import safe_imports
 
 __all__ = [
     "Worker",
@@ -105,7 +106,7 @@ class Worker:
         work = pickle.dumps((function, task))  # here, so that a failure to read it there is reported like any other
         self._process = context.Process(target=_serve, args=(theirs, work, has_requests), daemon=True)
         self._fewer = fewer
-        with _one_thread():
+        with _one_thread(), safe_imports():
             self._process.start()
         theirs.close()
 

@@ -15,7 +15,6 @@ import os
 import secrets
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +29,7 @@ from snarfcli.hydra_config.overrides import quote
 from snarfcli.locks import one_of
 from snarfcli.reproduce.jobs import JobStatus, run_job
 from snarfcli.reproduce.plans import Job
+from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.texts import one_line
 
 __all__ = ["LAUNCHERS", "Launcher", "check_launcher", "is_installed", "launch", "run_planned_job"]
@@ -105,7 +105,7 @@ def launch(
     said = work / "launcher.log"
     with said.open("w") as file:
         process = subprocess.Popen(
-            [sys.executable, "-m", "snarfcli", *_arguments(work, len(jobs), launcher)],
+            snarf_command(_arguments(work, len(jobs), launcher)), env=safe_environment(),
             stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
     seen: dict[int, JobStatus] = {}

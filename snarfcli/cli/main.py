@@ -15,7 +15,8 @@ from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.help import command_help, overview
 from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError, nearest
-from snarfcli.hydra_config.overrides import check_overrides, in_brackets
+from snarfcli.hydra_config.home import expand_home
+from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 
 __all__ = ["COMMANDS", "Command", "main"]
@@ -89,10 +90,9 @@ def _run(command: Command, arguments: list[str]) -> int:
 
 
 def _checked(overrides: list[str], schema: type, command: str) -> list[str]:
-    """Check the overrides of a command and return them as Hydra reads them: lists in brackets, presets with their group."""
-    if not {"-m", "--multirun"} & set(overrides):  # with it, commas separate jobs
-        lists = list_settings(schema)
-        overrides = [argument if argument.startswith("-") else in_brackets(argument, lists) for argument in overrides]
+    """Check the overrides of a command and return them as Hydra reads them, presets with their group."""
+    lists, is_multirun = list_settings(schema), bool({"-m", "--multirun"} & set(overrides))
+    overrides = [readable(one, lists, is_multirun) if "=" in one and not one.startswith("-") else one for one in overrides]
     settings = [argument for argument in overrides if not argument.startswith("-") and "=" in argument]
     check_overrides(settings, schema, command)
     presets = preset_groups(schema, command)
@@ -117,7 +117,7 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
         try:
             if missing:
                 raise UserError(f"{', '.join(missing)}: wanted a value, got none; give {missing[0]}=VALUE")
-            codes.append(run(OmegaConf.to_object(config)) or 0)
+            codes.append(run(expand_home(OmegaConf.to_object(config))) or 0)
         except Exception as error:  # reported here, not by Hydra; the next job of a multirun still runs
             codes.append(_report(command, error))
 

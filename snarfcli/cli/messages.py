@@ -69,6 +69,11 @@ def _config_message(chain: list[BaseException]) -> str:
     single = re.search(r"override (\S+?)=(\S*).*is not a ListConfig", text)
     if single:
         return f"{single.group(1)}: wanted a list, got {single.group(2)}; write {single.group(1)}=[{single.group(2)}]"
+    ambiguous = re.search(r"Ambiguous value for argument '(\S+?)=(.*?)'(?: 1\.|$)", text)
+    if ambiguous:
+        name, value = ambiguous.groups()
+        one_name = f"""{name}='"{value}"'"""
+        return f"{name}: wanted one value, got {value}; give -m for one run per value, or {one_name} for a name with a comma"
     lines = dict.fromkeys(" ".join(str(link).strip().splitlines()[0].split()) for link in chain if str(link).strip())
     return ": ".join(list(lines)[:2])
 

@@ -8,11 +8,14 @@ import time
 from collections.abc import Iterable, Iterator, Sized
 from typing import TypeVar
 
+from snarfcli.texts import one_line
+
 __all__ = ["progress"]
 
 log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
 _LOG_EVERY_S = 20.0
+_LONGEST_NAME = 80
 
 
 def progress(items: Iterable[_Item], *, total: int | None = None, desc: str, unit: str = "it") -> Iterator[_Item]:
@@ -24,6 +27,7 @@ def progress(items: Iterable[_Item], *, total: int | None = None, desc: str, uni
         desc: name of the task, such as "preprocess 50002".
         unit: name of one item.
     """
+    desc = one_line(desc, _LONGEST_NAME)  # names of motions and subjects come from files
     if total is None and isinstance(items, Sized):
         total = len(items)
     if sys.stderr.isatty():

@@ -14,6 +14,7 @@ from snarfcli.cli.command_list import COMMANDS, Command
 from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.help import command_help, overview
 from snarfcli.cli.messages import user_message
+from snarfcli.cli.terminal import print_error, set_up_output
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import check_overrides, readable
@@ -48,17 +49,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if arguments[0] not in COMMANDS:
         hint = nearest(arguments[0], _shown())
-        print(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(_shown())}", file=sys.stderr)
+        print_error(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(_shown())}")
         return EXIT_USER_ERROR
     command = COMMANDS[arguments[0]]
     # Set before PyTorch is loaded: its threads would otherwise spin for milliseconds after every operation, on cores that the
     # threads of the native library and other processes need. Training steps take equally long with and without it.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    _set_up_logging()
+    set_up_output()
     try:
         return _run(command, arguments[1:])
     except KeyboardInterrupt:
-        print(f"snarf {command.name}: interrupted", file=sys.stderr)
+        print_error(f"snarf {command.name}: interrupted")
         return EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of the output has ended, as in "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -72,7 +73,7 @@ def _report(command: Command, error: Exception) -> int:
     message = user_message(error)
     if message is None:
         raise error
-    print(f"snarf {command.name}: {message}", file=sys.stderr)
+    print_error(f"snarf {command.name}: {message}")
     return EXIT_USER_ERROR
 
 
@@ -137,10 +138,3 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
 def _shown() -> list[str]:
     """Return the names of the commands that the help lists."""
     return [name for name, command in COMMANDS.items() if not command.is_hidden]
-
-
-def _set_up_logging() -> None:
-    """Print the program's own messages on standard output, without time or level."""
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout)
-    logging.getLogger("snarfcli").setLevel(logging.INFO)
-    logging.raiseExceptions = False  # no trace when the reader of the output has ended, as in "| head"

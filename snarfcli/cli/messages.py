@@ -11,15 +11,26 @@ from snarfcli.texts import one_line
 __all__ = ["user_message"]
 
 
+_LONGEST = 2000  # characters; names in a file can be of any length
+
+
 def user_message(error: BaseException) -> str | None:
-    """Return one line for a user error, or None for a fault of the program."""
+    """Return one line of bounded length for a user error, or None for a fault of the program."""
+    message = _message(error)
+    if message is None:
+        return None
+    line = one_line(message)
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 3]}..."
+
+
+def _message(error: BaseException) -> str | None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     chain = _chain(error)
     for link in chain:
         if isinstance(link, UserError):
-            return one_line(link)
+            return one_line(link)  # the name of its type, if it has no message
     for link in chain:
         if isinstance(link, OSError) and not isinstance(link, (ConnectionError, ChildProcessError)):
             return _file_message(link)

@@ -12,12 +12,15 @@ from snarfcli.texts import terminal_text
 
 __all__ = ["TerminalFormatter", "print_error", "set_up_output"]
 
+_LONGEST = 20_000  # characters of one log record; the longest table has 3,000
+
 
 class TerminalFormatter(logging.Formatter):
     """Formats log records for a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return terminal_text(super().format(record))
+        text = super().format(record)
+        return terminal_text(text if len(text) <= _LONGEST else f"{text[:_LONGEST]}...")
 
 
 def set_up_output() -> None:

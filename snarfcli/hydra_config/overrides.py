@@ -125,11 +125,11 @@ def _is_list(value: str) -> bool:
 
 def _split(text: str) -> list[str]:
     """Return the parts of a text between commas; those in quotes, brackets or braces separate nothing."""
-    parts, depth, open_quote, before = [""], 0, "", ","
-    for letter in text:
+    parts, depth, open_quote, before = [""], 0, "", ""
+    for index, letter in enumerate(text):
         if letter == open_quote and before != "\\":
             open_quote = ""
-        elif not open_quote and letter in "'\"" and before in ",=[{(: ":  # it's has an apostrophe
+        elif not open_quote and letter in "'\"" and letter in text[index + 1 :]:  # it's has an apostrophe
             open_quote = letter
         depth += 0 if open_quote else (letter in "[{") - (letter in "]}")
         if letter == "," and not depth and not open_quote:

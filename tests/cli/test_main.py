@@ -193,16 +193,24 @@ BARE = (
 
 
 @pytest.mark.parametrize("value", BARE)
-def test_values_need_no_quotes(capsys, value):
-    code, out, err = run(capsys, "eval", f"ckpt={value}", "--cfg", "job")
+def test_values_need_no_quotes(value):
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    def read(override: str, **more: bool) -> object:
+        return OverridesParser.create().parse_override(readable(override, {"pose"}, **more)).value()
+
+    assert read(f"ckpt={value}") == value
+    assert read(f"ckpt={value}", is_multirun=True) == value
+    assert read(f"pose={value}") == [value]
+    assert read(f"pose={value},b.npz") == [value, "b.npz"]
+    assert read(f"pose=[{value},b.npz]") == [value, "b.npz"]
+
+
+def test_a_command_gets_values_without_quotes(capsys):
+    code, out, err = run(capsys, "view", "ckpt=~/größe (1).pt", "pose=тест.npz,it's.bvh", "--cfg", "job")
     assert code == 0, err
-    assert yaml.safe_load(out)["ckpt"] == value
-    code, out, err = run(capsys, "view", f"pose={value}", "--cfg", "job")
-    assert code == 0, err
-    assert yaml.safe_load(out)["pose"] == [value]
-    code, out, err = run(capsys, "view", f"pose=[{value},b.npz]", "--cfg", "job")
-    assert code == 0, err
-    assert yaml.safe_load(out)["pose"] == [value, "b.npz"]
+    config = yaml.safe_load(out)
+    assert (config["ckpt"], config["pose"]) == ("~/größe (1).pt", ["тест.npz", "it's.bvh"])
 
 
 def test_values_that_are_meant_for_hydra_stay_so(capsys):

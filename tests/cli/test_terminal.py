@@ -23,6 +23,11 @@ def test_log_lines():
     assert terminal.TerminalFormatter("%(message)s").format(record) == f"motion: {SHOWN}\n\tnext"
 
 
+def test_log_lines_have_bounded_length():
+    record = logging.LogRecord("snarfcli.x", logging.INFO, __file__, 1, "motion: %s", ("x" * 10**6,), None)
+    assert len(terminal.TerminalFormatter("%(message)s").format(record)) == 20_003
+
+
 def test_messages(capsys):
     assert cli.main([f"train{HOSTILE}"]) == 2
     assert cli.main(["train", f"run=x/{HOSTILE}"]) == 2

@@ -4,7 +4,7 @@
     python tools/trust_memory.py --only preprocess animate
 
 Prints the resident memory and the number of open files of the process after 10, 50 and 100 % of the work, and the memory of
-20 million points in one call of `Avatar.occupancy`. Linux only; about ten minutes on one core. The exit code is 1 if something
+20 million points in one call of `Avatar.occupancy`. Linux only; about half an hour on one core. The exit code is 1 if something
 grows.
 """
 

@@ -22,6 +22,7 @@ from typing import Any
 from snarfcli.errors import UserError
 from snarfcli.interrupts import SIGNALS, interrupts_held_back
 from snarfcli.locks import inherited_locks
+from snarfcli.safe_start import safe_imports
 
 __all__ = ["Worker", "choose_processes", "count_cores", "end_workers", "parse_processes", "run_in_processes"]
 
@@ -100,7 +101,7 @@ class Worker:
         work = pickle.dumps((function, task))  # here, so that a failure to read it there is reported like any other
         self._process = context.Process(target=_serve, args=(theirs, work, has_requests, _Locks()), daemon=True)
         self._fewer = fewer
-        with _one_thread():
+        with _one_thread(), safe_imports():
             self._process.start()
         theirs.close()
 

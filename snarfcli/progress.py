@@ -16,6 +16,7 @@ __all__ = ["progress", "progress_bar"]
 log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
 _LOG_EVERY_S = 20.0
+_LONGEST_NAME = 80
 
 
 def progress(items: Iterable[_Item], *, total: int | None = None, desc: str, unit: str = "it") -> Iterator[_Item]:
@@ -27,6 +28,7 @@ def progress(items: Iterable[_Item], *, total: int | None = None, desc: str, uni
         desc: name of the task, such as "preprocess 50002".
         unit: name of one item.
     """
+    desc = one_line(desc, _LONGEST_NAME)  # names of motions and subjects come from files
     if total is None and isinstance(items, Sized):
         total = len(items)
     with progress_bar(total=total, desc=desc, unit=unit) as bar:
@@ -54,7 +56,6 @@ def progress_bar(*, total: int | None, done: int = 0, desc: str, unit: str) -> I
         return
     from tqdm import tqdm
 
-    desc = one_line(desc, 60)
     with tqdm(file=_Terminal(), total=total, initial=done, desc=desc, unit=unit, dynamic_ncols=True) as bar:
         yield bar
 

@@ -38,7 +38,7 @@ LAYERS = (
         "segments",
     ),
     ("locks",),
-    ("errors", "interrupts", "names", "texts", "versions"),
+    ("errors", "interrupts", "names", "safe_start", "texts", "versions"),
 )
 """Folders and top-level modules of the package, from the top layer down; those of one layer do not import each other."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import logging
 import os
@@ -15,8 +14,10 @@ from snarfcli.cli.command_list import COMMANDS, Command
 from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.help import command_help, overview
 from snarfcli.cli.messages import user_message
+from snarfcli.cli.terminal import print_error, set_up_output
 from snarfcli.errors import UserError, nearest
-from snarfcli.hydra_config.overrides import check_overrides, in_brackets
+from snarfcli.hydra_config.home import expand_home
+from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 from snarfcli.interrupts import exit_code, signals_as_interrupts
 
@@ -53,18 +54,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if arguments[0] not in COMMANDS:
         hint = nearest(arguments[0], _shown())
-        print(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(_shown())}", file=sys.stderr)
+        print_error(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(_shown())}")
         return EXIT_USER_ERROR
     command = COMMANDS[arguments[0]]
     # Set before PyTorch is loaded: its threads would otherwise spin for milliseconds after every operation, on cores that the
     # threads of the native library and other processes need. Training steps take equally long with and without it.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    _set_up_logging()
+    set_up_output()
     try:
         with signals_as_interrupts():
             return _run(command, arguments[1:])
     except KeyboardInterrupt as interrupt:
-        _say(f"snarf {command.name}: interrupted")
+        print_error(f"snarf {command.name}: interrupted")
         return exit_code(interrupt)
     except BrokenPipeError:  # the reader of the output has ended, as in "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -78,14 +79,8 @@ def _report(command: Command, error: Exception) -> int:
     message = user_message(error)
     if message is None:
         raise error
-    _say(f"snarf {command.name}: {message}")
+    print_error(f"snarf {command.name}: {message}")
     return EXIT_USER_ERROR
-
-
-def _say(line: str) -> None:
-    """Print a line on standard error, if that still exists: the terminal may be closed."""
-    with contextlib.suppress(OSError):
-        print(line, file=sys.stderr, flush=True)
 
 
 def _open_standard_streams() -> None:
@@ -115,10 +110,9 @@ def _run(command: Command, arguments: list[str]) -> int:
 
 
 def _checked(overrides: list[str], schema: type, command: str) -> list[str]:
-    """Check the overrides of a command and return them as Hydra reads them: lists in brackets, presets with their group."""
-    if not {"-m", "--multirun"} & set(overrides):  # with it, commas separate jobs
-        lists = list_settings(schema)
-        overrides = [argument if argument.startswith("-") else in_brackets(argument, lists) for argument in overrides]
+    """Check the overrides of a command and return them as Hydra reads them, presets with their group."""
+    lists, is_multirun = list_settings(schema), bool({"-m", "--multirun"} & set(overrides))
+    overrides = [readable(one, lists, is_multirun) if "=" in one and not one.startswith("-") else one for one in overrides]
     settings = [argument for argument in overrides if not argument.startswith("-") and "=" in argument]
     check_overrides(settings, schema, command)
     presets = preset_groups(schema, command)
@@ -143,7 +137,7 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
         try:
             if missing:
                 raise UserError(f"{', '.join(missing)}: wanted a value, got none; give {missing[0]}=VALUE")
-            codes.append(run(OmegaConf.to_object(config)) or 0)
+            codes.append(run(expand_home(OmegaConf.to_object(config))) or 0)
         except Exception as error:  # reported here, not by Hydra; the next job of a multirun still runs
             codes.append(_report(command, error))
 
@@ -163,10 +157,3 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
 def _shown() -> list[str]:
     """Return the names of the commands that the help lists."""
     return [name for name, command in COMMANDS.items() if not command.is_hidden]
-
-
-def _set_up_logging() -> None:
-    """Print the program's own messages on standard output, without time or level."""
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout)
-    logging.getLogger("snarfcli").setLevel(logging.INFO)
-    logging.raiseExceptions = False  # no trace when the reader of the output has ended, as in "| head"

@@ -11,15 +11,26 @@ from snarfcli.texts import one_line
 __all__ = ["user_message"]
 
 
+_LONGEST = 2000  # characters; names in a file can be of any length
+
+
 def user_message(error: BaseException) -> str | None:
-    """Return one line for a user error, or None for a fault of the program."""
+    """Return one line of bounded length for a user error, or None for a fault of the program."""
+    message = _message(error)
+    if message is None:
+        return None
+    line = one_line(message)
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 3]}..."
+
+
+def _message(error: BaseException) -> str | None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     chain = _chain(error)
     for link in chain:
         if isinstance(link, UserError):
-            return one_line(link)
+            return one_line(link)  # the name of its type, if it has no message
     for link in chain:
         if isinstance(link, OSError) and not isinstance(link, (ConnectionError, ChildProcessError)):
             return _file_message(link)
@@ -69,6 +80,11 @@ def _config_message(chain: list[BaseException]) -> str:
     single = re.search(r"override (\S+?)=(\S*).*is not a ListConfig", text)
     if single:
         return f"{single.group(1)}: wanted a list, got {single.group(2)}; write {single.group(1)}=[{single.group(2)}]"
+    ambiguous = re.search(r"Ambiguous value for argument '(\S+?)=(.*?)'(?: 1\.|$)", text)
+    if ambiguous:
+        name, value = ambiguous.groups()
+        one_name = f"""{name}='"{value}"'"""
+        return f"{name}: wanted one value, got {value}; give -m for one run per value, or {one_name} for a name with a comma"
     lines = dict.fromkeys(" ".join(str(link).strip().splitlines()[0].split()) for link in chain if str(link).strip())
     return ": ".join(list(lines)[:2])
 

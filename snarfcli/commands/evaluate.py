@@ -29,6 +29,7 @@ from snarfcli.models.start_bones import with_start_bones
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.store import SampleStore
+from snarfcli.texts import one_line
 
 __all__ = ["EvalConfig", "run"]
 
@@ -219,6 +220,7 @@ def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None
     for name, wanted in (("subject", store.subject), ("data", store.data)):
         trained_on = avatar.facts.get(name)
         if trained_on is not None and str(trained_on) not in (wanted, config.data.avatars):
+            trained_on = one_line(str(trained_on), 60)
             log.warning("warning: this avatar was trained on %s %s and is evaluated on %s %s", name, trained_on, name, wanted)
 
 

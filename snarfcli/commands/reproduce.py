@@ -18,8 +18,8 @@ from omegaconf import MISSING, OmegaConf
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.train import TrainConfig
 from snarfcli.errors import UserError
-from snarfcli.hydra_config.overrides import check_overrides
-from snarfcli.hydra_config.schema import config_folder, preset_groups, register_schemas
+from snarfcli.hydra_config.overrides import check_overrides, readable
+from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 from snarfcli.parallel import count_cores
 from snarfcli.reproduce.jobs import JobStatus, read_status
 from snarfcli.reproduce.launching import LAUNCHERS, Launcher, check_launcher, launch
@@ -140,6 +140,7 @@ def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
     from hydra import compose, initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
 
+    overrides = [readable(override, list_settings(TrainConfig)) for override in overrides]
     check_overrides(overrides, TrainConfig, "train")
     presets = preset_groups(TrainConfig, "train")
     named = [override.partition("=") for override in overrides]

@@ -17,7 +17,12 @@ from snarfcli.texts import one_line
 if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override
 
-__all__ = ["check_overrides", "in_brackets", "quote", "quote_items"]
+__all__ = ["check_overrides", "quote", "quote_items", "readable"]
+
+# What is meant for Hydra: a quoted text, a mapping, or a function such as range(1,4).
+_DELIBERATE = re.compile(
+    r"['\"]|\{.*\}$|(?:bool|choice|extend_list|float|glob|int|interval|json_str|range|shuffle|sort|str|tag)\(", re.DOTALL
+)
 
 
 def check_overrides(overrides: Sequence[str], schema: type, command: str = "") -> None:
@@ -73,16 +78,66 @@ def _values(override: Override) -> list[Any]:
     return [override.value()]
 
 
-def in_brackets(override: str, lists: Collection[str]) -> str:
-    """Return an override with brackets added if its setting is a list: views=front,left becomes views=[front,left].
+def readable(override: str, lists: Collection[str], is_multirun: bool = False) -> str:
+    """Return an override as Hydra's grammar reads it: lists in brackets, and values in quotes that it would refuse.
+
+    The grammar knows few characters outside quotes: no letters but A to Z, no parentheses, no ~ and others. Texts that look
+    like a quoted text, a mapping or one of Hydra's functions stay as they are.
 
     Args:
         override: NAME=VALUE.
-        lists: names of the settings that are lists.
+        lists: names of the settings that are lists; views=front,left becomes views=[front,left].
+        is_multirun: whether commas separate jobs, instead of the items of a list.
     """
     name, _, value = override.partition("=")
-    is_bare = name in lists and value not in ("", "null") and not value.startswith("[") and "${" not in value
-    return f"{name}=[{value}]" if is_bare else override
+    if is_multirun:
+        values = [_readable_value(one) for one in _split(value)]
+        return override if _is_readable(value) else f"{name}={','.join(values)}"
+    if name in lists:
+        value = value if value in ("", "null") or _is_list(value) or "${" in value else f"[{value}]"
+    return f"{name}={_readable_value(value)}"
+
+
+def _readable_value(value: str) -> str:
+    """Return one value, or a list, as Hydra's grammar reads it."""
+    if _is_readable(value) or _DELIBERATE.match(value):
+        return value
+    if _is_list(value):
+        return "[" + ",".join(one if _is_readable(f"[{one}]") else _readable_value(one) for one in _split(value[1:-1])) + "]"
+    return quote(value)
+
+
+def _is_readable(value: str) -> bool:
+    """Return whether Hydra's grammar reads a value."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        OverridesParser.create().parse_override(f"name={value}")
+    except HydraException:
+        return False
+    return True
+
+
+def _is_list(value: str) -> bool:
+    return value.startswith("[") and value.endswith("]")
+
+
+def _split(text: str) -> list[str]:
+    """Return the parts of a text between commas; those in quotes, brackets or braces separate nothing."""
+    parts, depth, open_quote, before = [""], 0, "", ""
+    for index, letter in enumerate(text):
+        if letter == open_quote and before != "\\":
+            open_quote = ""
+        elif not open_quote and letter in "'\"" and letter in text[index + 1 :]:  # it's has an apostrophe
+            open_quote = letter
+        depth += 0 if open_quote else (letter in "[{") - (letter in "]}")
+        if letter == "," and not depth and not open_quote:
+            parts.append("")
+        else:
+            parts[-1] += letter
+        before = letter
+    return [part.strip() for part in parts]
 
 
 def quote(value: str) -> str:
@@ -97,18 +152,7 @@ def quote_items(value: str) -> str:
 
     Hydra's grammar allows no bare = inside a list. A value without brackets, and items in quotes, stay as they are.
     """
-    if not (value.startswith("[") and value.endswith("]")):
+    if not _is_list(value):
         return value
-    items, depth, open_quote = [""], 0, ""
-    for letter in value[1:-1]:
-        if letter == open_quote:
-            open_quote = ""
-        elif not open_quote and letter in "'\"":
-            open_quote = letter
-        depth += 0 if open_quote else (letter in "[{") - (letter in "]}")
-        if letter == "," and not depth and not open_quote:
-            items.append("")
-        else:
-            items[-1] += letter
-    items = [item.strip() for item in items]
+    items = _split(value[1:-1])
     return "[" + ",".join(item if not item or item[0] in "'\"" else quote(item) for item in items) + "]"

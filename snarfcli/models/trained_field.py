@@ -23,6 +23,7 @@ from snarfcli.models.back_d import BackD
 from snarfcli.models.back_lbs import BackLBS
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.fast_snarf import FastSnarf
+from snarfcli.models.in_parts import points_in_parts, queries_in_parts
 from snarfcli.models.nasa import Nasa
 from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
@@ -194,12 +195,20 @@ class TrainedField:
         return self.skeleton.posed_from_canonical(pose, translation).to(self.device)
 
     def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> FieldSamples:
-        """Evaluate the posed field at points [B, N, 3] under bone transforms [B, J, 4, 4] and pose [B, J, 3]."""
-        return self.shape_at(self.find(points, bone_transforms, pose), pose)
+        """Evaluate the posed field at points [B, N, 3] under bone transforms [B, J, 4, 4] and pose [B, J, 3].
+
+        Points are evaluated in parts: besides the result, 13 bytes per point, it needs less than 1 GiB for any number of them.
+        """
+
+        def evaluate(points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+            values = self.shape_at(self.find(points, bone_transforms, pose), pose)
+            return values.logits, values.found, values.counts
+
+        return FieldSamples(*queries_in_parts(evaluate, points, bone_transforms, pose))
 
     @torch.no_grad()
     def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> Found:
-        """Go back to the canonical frame, the first half of `query`."""
+        """Go back to the canonical frame, the first half of `query`; all points at once, about 0.8 kB for each."""
         return self.model.find(points.to(self.device), bone_transforms.to(self.device), pose.to(self.device))
 
     @torch.no_grad()
@@ -210,12 +219,18 @@ class TrainedField:
     def occupancy(self, points: Tensor, pose: Tensor, translation: Tensor | None = None) -> Tensor:
         """Return occupancy probabilities [B, N] at posed points [B, N, 3], metres.
 
+        Besides the result it needs less than 1 GiB for any number of points, see `query`.
+
         Args:
             points: [B, N, 3], posed frame, metres.
             pose: [B, J, 3], axis-angle, radians, global orientation included.
             translation: [B, 3], metres.
         """
-        return self.query(points, self.bone_transforms(pose, translation), pose).logits.sigmoid()
+
+        def evaluate(*part: Tensor) -> tuple[Tensor, ...]:
+            return (self.query(*part).logits,)
+
+        return queries_in_parts(evaluate, points, self.bone_transforms(pose, translation), pose)[0].sigmoid_()
 
     @torch.no_grad()
     def canonical_logits(self, canonical: Tensor, pose: Tensor) -> Tensor:
@@ -228,21 +243,26 @@ class TrainedField:
         """
         if not self.model.has_canonical_shape:
             raise ValueError(f"model {self.config.model.name} has no canonical shape")
-        canonical = canonical.to(self.device)
-        searched = self.model.is_searched(canonical).nonzero()[:, 0]
         condition = self.model.condition(pose[None].to(self.device))
-        values = self.model.canonical_logits(canonical[searched], condition, torch.zeros_like(searched))
-        return canonical.new_full((len(canonical),), NO_CORRESPONDENCE).index_copy(0, searched, values)
+
+        def evaluate(points: Tensor) -> Tensor:
+            points = points.to(self.device)
+            searched = self.model.is_searched(points).nonzero()[:, 0]
+            values = self.model.canonical_logits(points[searched], condition, torch.zeros_like(searched))
+            return points.new_full((len(points),), NO_CORRESPONDENCE).index_copy(0, searched, values)
+
+        return points_in_parts(evaluate, canonical)
 
     @torch.no_grad()
     def skinning_weights(self, canonical: Tensor) -> Tensor:
         """Return the skinning weights [N, J] at canonical points [N, 3]; ValueError if the system has none."""
-        return self.model.skinning_weights(canonical.to(self.device))
+        return points_in_parts(lambda points: self.model.skinning_weights(points.to(self.device)), canonical)
 
     @torch.no_grad()
     def skin(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
         """Move canonical points [N, 3] into the pose of bone transforms [J, 4, 4]; ValueError if the system has no weights."""
-        return self.model.skin(canonical.to(self.device), bone_transforms.to(self.device))
+        transforms = bone_transforms.to(self.device)
+        return points_in_parts(lambda points: self.model.skin(points.to(self.device), transforms), canonical)
 
     def canonical_box(self) -> tuple[Tensor, Tensor]:
         """Return the corners (lower [3], upper [3]) of the canonical box that holds the body, metres."""

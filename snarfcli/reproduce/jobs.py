@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -17,6 +16,7 @@ from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json, write_json
 from snarfcli.locks import inherited_locks, locked
 from snarfcli.reproduce.plans import EvaluationStage, Job
+from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.samples.layout import samples_folder
 
 __all__ = ["LOG", "STATUS", "JobStatus", "JobStopped", "is_evaluated", "read_status", "run_command", "run_job"]
@@ -190,7 +190,7 @@ def run_command(arguments: Sequence[str], log: Path, stopped: Callable[[], bool]
         file.write(f"$ snarf {' '.join(arguments)}\n")
         file.flush()
         process = subprocess.Popen(
-            [sys.executable, "-m", "snarfcli", *arguments, "wait=true"],
+            snarf_command([*arguments, "wait=true"]), env=safe_environment(),
             stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, pass_fds=inherited_locks(),
         )  # fmt: skip
         try:

@@ -16,7 +16,6 @@ import secrets
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -30,6 +29,7 @@ from snarfcli.interrupts import signals_as_interrupts
 from snarfcli.locks import hold_output, holder_is_gone, inherited_locks, lock_file, one_of, try_lock
 from snarfcli.reproduce.jobs import JobStatus, run_job
 from snarfcli.reproduce.plans import Job
+from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.texts import one_line
 
 __all__ = ["LAUNCHERS", "Launcher", "check_launcher", "is_installed", "launch", "run_planned_job"]
@@ -115,7 +115,7 @@ def _launch(
     said = work / "launcher.log"
     with said.open("w") as file:
         process = subprocess.Popen(
-            [sys.executable, "-m", "snarfcli", *_arguments(work, len(jobs), launcher)],
+            snarf_command(_arguments(work, len(jobs), launcher)), env=safe_environment(),
             stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
             pass_fds=inherited_locks(),
         )  # fmt: skip

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
+import logging
+from pathlib import Path
+
 import pytest
+import yaml
 
 from snarfcli.cli import main as cli
 from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError
+from snarfcli.hydra_config.home import expand_home
+from snarfcli.hydra_config.overrides import quote_items, readable
 from snarfcli.hydra_config.schema import describe, group_schemas, setting_names
 
 COMMANDS = ("preprocess", "train", "eval", "animate", "export", "doctor", "reproduce")
@@ -42,8 +49,6 @@ def test_help_shows_purpose_example_choices_and_every_setting(capsys, name):
     assert code == 0
     assert command.summary in out
     assert command.example in out
-    import importlib
-
     schema = getattr(importlib.import_module(f"snarfcli.commands.{command.module}"), command.schema)
     for setting, text in describe(schema):
         assert text, f"{setting} has no description"
@@ -87,6 +92,10 @@ WRONG = {
     ("train", "device=gpu"): "device: wanted auto, cpu, cuda or cuda:N, got 'gpu'",
     ("train", "device=cuda:7"): "device: wanted cuda:7, got ",
     ("train", "threads=0", "data_root=none"): "threads: wanted at least 1, got 0",
+    ("animate", "motion=lunges,splits"): "motion: wanted one value, got lunges,splits; give -m for one run per value, or",
+    ("eval", "output_root=~nobody-has-this-name/o"): "output_root: there is no home folder ~nobody-has-this-name; give the",
+    ("eval", "ckpt=${oc.env:HOME"): "missing BRACE_CLOSE",
+    ("eval", "ckpt={a.pt}"): "cannot read 'ckpt={a.pt}'",
     ("train",): 'no samples of subject 50002 under data/processed/builtin; run "snarf preprocess',
     ("preprocess", "subject=50003"): "no built-in subject '50003'; did you mean '500",
     ("eval",): 'no avatar in outputs/builtin/50002/fast_snarf; run "snarf train subject=50002" or give ckpt=PATH',
@@ -175,3 +184,89 @@ def test_one_value_given_as_a_list_is_told_how_to_write_it(capsys):
     code, _, error = run(capsys, "animate", "motion=[lunges,splits]")
     assert code == 2
     assert error == "snarf animate: motion: wanted one value, got a list; write motion=lunges\n"
+
+
+BARE = (
+    "größe", "тест.npz", "模型.pt", "/mnt/Daten (alt)/x", "a~b.pt", r"C:\Users\x y\a.bvh", "it's", 'say "hi"',
+    "a@b&c#d!e", "a=b", "[x]#:y", "x[1].npz", "{a}_b", "a^b;c`d`<e>", "c:\\größe\\", "plain", "range of motion(1)",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("value", BARE)
+def test_values_need_no_quotes(value):
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    def read(override: str, **more: bool) -> object:
+        return OverridesParser.create().parse_override(readable(override, {"pose"}, **more)).value()
+
+    assert read(f"ckpt={value}") == value
+    assert read(f"ckpt={value}", is_multirun=True) == value
+    assert read(f"pose={value}") == [value]
+    assert read(f"pose={value},b.npz") == [value, "b.npz"]
+    assert read(f"pose=[{value},b.npz]") == [value, "b.npz"]
+
+
+def test_a_command_gets_values_without_quotes(capsys):
+    code, out, err = run(capsys, "view", "ckpt=~/größe (1).pt", "pose=тест.npz,it's.bvh", "--cfg", "job")
+    assert code == 0, err
+    config = yaml.safe_load(out)
+    assert (config["ckpt"], config["pose"]) == ("~/größe (1).pt", ["тест.npz", "it's.bvh"])
+
+
+def test_values_that_are_meant_for_hydra_stay_so(capsys):
+    lists = {"views"}
+    texts = ["b", "null", "'größe'", '"x y"', "[1,2]", "{b:1}", "range(1,3)", "${b.c}/d", "1,2", "'unclosed", "{ö}"]
+    for text in [f"a={value}" for value in texts]:
+        assert readable(text, lists) == text
+    assert readable("a=${b.c}/ö", lists) == "a='${b.c}/ö'"
+    assert readable("views=front,ö,'l,m'", lists) == "views=[front,'ö','l,m']"
+    assert readable("a=ö,b", lists) == "a='ö,b'"
+    assert readable("a=ö,b,'c,d'", lists, is_multirun=True) == "a='ö',b,'c,d'"
+    assert readable("views=[ö,b],[c]", lists, is_multirun=True) == "views=['ö',b],[c]"
+    assert readable("a=[it's,b]", lists) == "a=['it\\'s',b]"
+    assert quote_items("[a.b=it's,c=[8,8]]") == "['a.b=it\\'s','c=[8,8]']"
+
+
+def test_every_job_of_a_multirun_gets_its_name(capsys):
+    code, _, err = run(capsys, "eval", "-m", "run=größe,zweite (neu)")
+    assert code == 2
+    assert [line.partition(";")[0].rpartition("/")[2] for line in err.splitlines()] == ["größe", "zweite (neu)"]
+
+
+def test_the_home_folder_is_meant_by_a_tilde(capsys, elsewhere, monkeypatch):
+    monkeypatch.setenv("HOME", str(elsewhere / "home"))
+    monkeypatch.setenv("USERPROFILE", str(elsewhere / "home"))
+    code, _, err = run(capsys, "eval", "output_root=~/o")
+    assert code == 2
+    assert f"no avatar in {elsewhere / 'home' / 'o'}" in err
+    assert f"no avatar at {elsewhere / 'home' / 'a.pt'}" in run(capsys, "eval", "ckpt='~/a.pt'")[2]
+    assert str(elsewhere / "home" / "x.bvh") in run(capsys, "doctor", "--pose=~/x.bvh")[2]
+    assert run(capsys, "preprocess", "subject=50002", "data_root=~/d", "sequences=[none]")[0] == 2
+    assert not (elsewhere / "~").exists()
+
+
+def test_the_home_folder_is_expanded_in_lists_and_at_the_start_only(monkeypatch):
+    monkeypatch.setenv("HOME", "/h")
+    monkeypatch.setenv("USERPROFILE", "/h")
+    config = importlib.import_module("snarfcli.commands.reproduce").ReproduceConfig(
+        what="~", subjects=["~/a", "b~/c", "~d"], extra=["data.folder=~/x"], seeds=[1], report=None
+    )
+    expanded = expand_home(config)
+    home = str(Path("/h"))
+    assert (expanded.what, expanded.subjects) == (home, [str(Path("/h/a")), "b~/c", "~d"])
+    assert (expanded.extra, expanded.seeds, expanded.report) == (["data.folder=~/x"], [1], None)
+
+
+def test_reproduce_passes_names_on(capsys, caplog, elsewhere, monkeypatch):
+    caplog.set_level(logging.INFO)
+    monkeypatch.setenv("HOME", str(elsewhere / "home"))
+    monkeypatch.setenv("USERPROFILE", str(elsewhere / "home"))
+    code, _, err = run(
+        capsys, "reproduce", "table1", "data_root=~/Daten (alt)", "output_root=größe", "--dry-run", "systems=[snarf]",
+        "extra=[skinning.weights_file=~/w (1).npz]", "subjects=50002",
+    )  # fmt: skip
+    assert code == 0, err
+    arguments = next(line for line in caplog.messages if "snarf train " in line)
+    assert f"data_root='{elsewhere / 'home' / 'Daten (alt)'}'" in arguments
+    assert "output_root='größe'" in arguments
+    assert not (elsewhere / "~").exists()

@@ -1,0 +1,54 @@
+"""What the commands print: control characters are made visible, since names in a message can come from any file."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sys
+import traceback
+import warnings
+from types import TracebackType
+
+from snarfcli.texts import terminal_text
+
+__all__ = ["TerminalFormatter", "print_error", "set_up_output"]
+
+_LONGEST = 20_000  # characters of one log record; the longest table has 3,000
+
+
+class TerminalFormatter(logging.Formatter):
+    """Formats log records for a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = super().format(record)
+        return terminal_text(text if len(text) <= _LONGEST else f"{text[:_LONGEST]}...")
+
+
+def set_up_output() -> None:
+    """Print the program's own messages on standard output, without time or level; make other output safe to show too."""
+    handler = logging.StreamHandler(sys.stdout)
+    handler.setFormatter(TerminalFormatter("%(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    logging.getLogger("snarfcli").setLevel(logging.INFO)
+    logging.raiseExceptions = False  # no trace when the reader of the output has ended, as in "| head"
+    warnings.formatwarning = _format_warning
+    sys.excepthook = _print_trace
+
+
+def print_error(text: str) -> None:
+    """Print one message on standard error, if that still exists: the terminal may be closed."""
+    with contextlib.suppress(OSError, ValueError):
+        print(terminal_text(text), file=sys.stderr, flush=True)
+
+
+def _format_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    return terminal_text(_original_format(message, category, filename, lineno, line))
+
+
+def _print_trace(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    print_error("".join(traceback.format_exception(kind, error, trace)).rstrip())
+
+
+_original_format = warnings.formatwarning

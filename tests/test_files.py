@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import stat
 import zipfile
 from pathlib import Path
 
@@ -11,7 +13,16 @@ import pytest
 import torch
 
 from snarfcli.errors import UserError
-from snarfcli.files import atomic_path, list_npz, read_json, read_npy, read_npz, write_json, write_tensors
+from snarfcli.files import (
+    atomic_path,
+    list_npz,
+    read_json,
+    read_npy,
+    read_npz,
+    remove_temporaries,
+    write_json,
+    write_tensors,
+)
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
@@ -31,6 +42,37 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
         write_json(path, {"a": float("nan")})
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == ["a.json"]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def noted_fsync(descriptor: int) -> None:
+        done.append(f"flush {'folder' if stat.S_ISDIR(os.fstat(descriptor).st_mode) else 'file'}")
+        fsync(descriptor)
+
+    def noted_replace(old: Path, new: Path) -> None:
+        done.append("rename")
+        replace(old, new)
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(os, "replace", noted_replace)
+    write_json(tmp_path / "a.json", 1)
+    assert done[:2] == ["flush file", "rename"]
+    assert done[2:] == (["flush folder"] if os.name == "posix" else [])
+
+
+def test_what_killed_processes_leave_is_known_by_its_name(tmp_path: Path) -> None:
+    left = (".avatar.0123abcd.tmp.pt", ".run.e.0123abcd.tmp.pt", ".frame_000000.0123abcd.tmp.ply", ".README.0123abcd.tmp")
+    others = (".avatar.tmp.pt", "avatar.0123abcd.tmp.pt", ".avatar.0123abcX.tmp.pt", ".lock", "avatar.pt")
+    for name in (*left, *others):
+        (tmp_path / name).touch()
+    remove_temporaries(tmp_path, "avatar.pt", "README")
+    assert {path.name for path in tmp_path.iterdir()} == {*others, *left[1:3]}
+    remove_temporaries(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(others)
+    remove_temporaries(tmp_path / "missing")
 
 
 @pytest.mark.parametrize("text", ["{", "[" * 100_000, "1" * 5000, "\xff", "", " " * (2**25 + 1)])

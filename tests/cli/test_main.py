@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import importlib
 import logging
+import shlex
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -156,11 +160,24 @@ def test_user_error_inside_another_error_is_found():
     assert user_message(error) == "the reason"
 
 
-def test_interrupt_is_130(capsys, monkeypatch):
-    monkeypatch.setattr(cli, "_run", lambda command, arguments: (_ for _ in ()).throw(KeyboardInterrupt))
-    code, _, err = run(capsys, "train")
-    assert code == 130
+@pytest.mark.parametrize(("number", "wanted"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_requests_to_end_have_exit_codes(capsys, monkeypatch, number, wanted):
+    monkeypatch.setattr(cli, "_run", lambda command, arguments: signal.raise_signal(number))
+    before = signal.signal(number, signal.default_int_handler)  # ignored where the tests run in the background of a script
+    try:
+        code, _, err = run(capsys, "train")
+    finally:
+        signal.signal(number, before)
+    assert code == wanted
     assert err.strip() == "snarf train: interrupted"
+
+
+@pytest.mark.parametrize("streams", ["2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_commands_need_no_open_streams(tmp_path, streams):
+    command = f"{shlex.join([sys.executable, '-m', 'snarfcli', 'doctor'])} output_root={shlex.quote(str(tmp_path))} {streams}"
+    wrong = command.replace("doctor", "doctr")
+    assert subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True).returncode == 0
+    assert subprocess.run(wrong, shell=True, cwd=tmp_path, capture_output=True).returncode == 2
 
 
 def test_setting_names_are_dotted():

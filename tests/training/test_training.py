@@ -12,6 +12,7 @@ from toy_training import avatar_config, new_avatar, toy_store, training_config
 
 from snarfcli.avatar import Avatar
 from snarfcli.errors import UserError
+from snarfcli.interrupts import SIGNALS, exit_code
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.extent import unpose_by_nearest_bone
 from snarfcli.training.loop import train
@@ -94,25 +95,35 @@ def test_other_settings_cannot_be_resumed(store):
         other.restore(state, "checkpoint.pt")
 
 
-def test_interrupt_ends_the_step_and_leaves_a_checkpoint(store, tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_interrupt_ends_the_step_and_leaves_a_checkpoint(store, tmp_path, number, code):
     trainer = trainer_for(store)
     advance = trainer.advance
 
     def interrupted_advance():
         if trainer.step == 4:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
+            signal.raise_signal(signal.SIGHUP)  # a closed terminal sends more than one
         return advance()
 
     trainer.advance = interrupted_advance
-    before = signal.getsignal(signal.SIGINT)  # ignored where the tests run in the background of a script
-    with pytest.raises(KeyboardInterrupt):
-        train(trainer, tmp_path, on_scalars=lambda step, numbers: None)
+    handlers = {SIGNALS[0]: signal.default_int_handler} | dict.fromkeys(SIGNALS[1:], signal.SIG_DFL)
+    # ignored where the tests run in the background of a script
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        with pytest.raises(KeyboardInterrupt) as interrupt:
+            train(trainer, tmp_path, on_scalars=lambda step, numbers: None)
+        assert {number: signal.getsignal(number) for number in SIGNALS} == handlers
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+    assert exit_code(interrupt.value) == code
     state = load_checkpoint(tmp_path / "checkpoint.pt", CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint")
     assert state["step"] == 5
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.pt"]
     again = trainer_for(store)
     again.restore(state, "checkpoint.pt")
-    assert signal.getsignal(signal.SIGINT) is before
+    assert again.seconds == trainer.seconds > 0
 
 
 def test_learning_rate_warms_up_and_falls(store):

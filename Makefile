@@ -9,13 +9,14 @@ SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
 C_FAMILY = $(shell find csrc tests/native tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
 
-.PHONY: help setup demo test fuzz sanitize lint format bench clean
+.PHONY: help setup demo test fuzz trust sanitize lint format bench clean
 
 help:
 	@echo "make setup     install snarf into $(VENV)"
 	@echo "make demo      run the whole pipeline on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
 	@echo "make test      run the tests"
 	@echo "make fuzz      read 20,000 damaged files with every file reader"
+	@echo "make trust     crash, disturb and attack the commands, and measure their memory, for some hours (Linux)"
 	@echo "make sanitize  test the native library built with AddressSanitizer and UndefinedBehaviorSanitizer (Linux)"
 	@echo "make lint      check style, format and types of the code"
 	@echo "make format    format the code"
@@ -41,6 +42,14 @@ test: $(INSTALLED)
 
 fuzz: $(INSTALLED)
 	$(VENV)/bin/python tools/fuzz_readers.py --count 20000
+
+# The short forms of these are among the tests. What is promised is in docs/promises.md.
+trust: $(INSTALLED)
+	$(VENV)/bin/python tools/trust_faults.py
+	$(VENV)/bin/python tools/trust_pairs.py
+	$(VENV)/bin/python tools/trust_viewer.py
+	$(VENV)/bin/python tools/trust_memory.py
+	for seed in 1 2 3; do $(VENV)/bin/python tools/fuzz_readers.py --count 5000 --seed $$seed --only own || exit 1; done
 
 sanitize: $(INSTALLED)
 	tools/sanitize.sh $(VENV)

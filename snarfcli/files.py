@@ -25,6 +25,7 @@ __all__ = [
     "MAX_ARRAY_BYTES",
     "atomic_path",
     "file_digest",
+    "find_temporaries",
     "flush_to_disk",
     "list_npz",
     "read_json",
@@ -92,10 +93,18 @@ def remove_temporaries(folder: Path, *names: str) -> None:
         folder: the folder, which need not exist.
         names: names of the files that were being written; any if none is given.
     """
-    for path in folder.iterdir() if folder.is_dir() else ():
+    for path in find_temporaries(folder, *names):
+        path.unlink(missing_ok=True)
+
+
+def find_temporaries(folder: Path, *names: str, recursive: bool = False) -> list[Path]:
+    """Return the files that `remove_temporaries` deletes; with `recursive`, also those in the folders below."""
+    found = []
+    for path in folder.glob("**/.*.tmp*" if recursive else ".*.tmp*"):
         match = _TEMPORARY.fullmatch(path.name)
         if match and (not names or match[1] + match[2] in names):
-            path.unlink(missing_ok=True)
+            found.append(path)
+    return found
 
 
 def flush_to_disk(path: Path) -> None:

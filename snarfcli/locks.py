@@ -26,6 +26,7 @@ from snarfcli.errors import UserError
 from snarfcli.texts import one_line
 
 __all__ = [
+    "can_lock",
     "clear_killed",
     "hold_all_inside",
     "hold_output",
@@ -34,6 +35,7 @@ __all__ = [
     "lock_file",
     "locked",
     "one_of",
+    "outputs_in_use",
     "try_lock",
 ]
 
@@ -90,6 +92,34 @@ def clear_killed(output: str | Path) -> None:
 def holder_is_gone(output: Path) -> bool:
     """Return whether the process that held the lock of an output has been killed; False if that cannot be known."""
     return _is_gone(_read(_about(output)))
+
+
+def outputs_in_use(folder: Path) -> list[str]:
+    """Return one line for each output below a folder that a process holds: which one, by whom and since when."""
+    lines = []
+    for path in sorted(folder.rglob(".*.lock")):
+        release = try_lock(path)
+        if release is None:
+            output = path.with_name(path.name[1:].removesuffix(".lock"))
+            lines.append(f"{output} {_described(_read(_about(output)))}")
+        else:
+            release()
+    return lines
+
+
+def can_lock(folder: Path) -> bool:
+    """Return whether the file system of a folder has locks.
+
+    Raises:
+        OSError: nothing can be written there.
+    """
+    path = folder / f".snarf-{os.getpid()}.lock"
+    first = try_lock(path)
+    second = try_lock(path)
+    for release in (second, first):
+        if release is not None:
+            release()
+    return second is None
 
 
 @contextmanager

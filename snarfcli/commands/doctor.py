@@ -17,6 +17,7 @@ from pathlib import Path
 from omegaconf import MISSING
 
 import snarfcli
+from snarfcli.commands.doctor_findings import Finding, promises
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.parallel import count_cores
 from snarfcli.texts import one_line
@@ -63,16 +64,6 @@ class DoctorConfig:
     """Name or number of the animation or person in the motion file; null for the first."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One line of the report."""
-
-    name: str
-    text: str
-    is_fallback: bool = False
-    """Whether the described part is missing, or replaced by a slower one."""
-
-
 def run(config: DoctorConfig) -> int:
     """Print the report. A part that cannot be examined is reported with its error, and the other parts follow.
 
@@ -89,6 +80,7 @@ def run(config: DoctorConfig) -> int:
         "GPU": _gpu,
         "tools": _tools,
         "data": lambda: _data(Path(config.data_root), Path(config.output_root)),
+        "what is promised (docs/promises.md)": lambda: promises(Path(config.data_root), Path(config.output_root)),
     }
     fallbacks: list[str] = []
     for title, examine in sections.items():

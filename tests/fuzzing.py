@@ -26,7 +26,7 @@ from fuzz_damage import DAMAGES
 
 from snarfcli.errors import UserError
 
-__all__ = ["Target", "broken_file", "check_target", "find_failures", "scratch_folder"]
+__all__ = ["Target", "broken_file", "check_target", "find_failures", "peak_memory", "scratch_folder"]
 
 MAX_CPU_SECONDS = 5.0  # processor time, which does not depend on how busy the machine is
 MAX_GROWTH = 2**30
@@ -91,11 +91,11 @@ def find_failures(target: Target, indices: Iterable[int], seed: int, folder: Pat
     assert seeds, f"{target.name}: no seeds"
     for number, content in enumerate(seeds):
         path.write_bytes(content)
-        failure, message = _try(target, path, _peak_memory())
+        failure, message = _try(target, path, peak_memory())
         if failure or message:
             yield f"{target.name}: seed {number} must be a good file: {failure or message}"
             return
-    peak = _peak_memory()
+    peak = peak_memory()
     for index in indices:
         content = broken_file(target, seed, index, seeds)
         (scratch / "index").write_text(str(index))
@@ -106,7 +106,7 @@ def find_failures(target: Target, indices: Iterable[int], seed: int, folder: Pat
             kept = folder / f"{target.name}-{seed}-{index}{target.suffix}"
             kept.write_bytes(content)
             yield f"{target.name}: file {index} of seed {seed}, kept as {kept}: {failure}"
-            peak = max(peak, _peak_memory() - MAX_GROWTH // 2)
+            peak = max(peak, peak_memory() - MAX_GROWTH // 2)
 
 
 def broken_file(target: Target, seed: int, index: int, seeds: list[bytes] | None = None) -> bytes:
@@ -154,7 +154,7 @@ def _try(target: Target, path: Path, peak: int) -> tuple[str, str]:
     cpu_seconds = time.process_time() - start
     if not failure and cpu_seconds > MAX_CPU_SECONDS:
         failure = f"took {cpu_seconds:.1f} s, wanted at most {MAX_CPU_SECONDS:g}"
-    if not failure and (growth := _peak_memory() - peak) > MAX_GROWTH:
+    if not failure and (growth := peak_memory() - peak) > MAX_GROWTH:
         failure = f"took {growth / 2**30:.1f} GiB of memory, wanted at most 1"
     if not failure and message:
         failure = _wrong_message(message, path)
@@ -219,7 +219,7 @@ def _audit(event: str, arguments: tuple) -> None:
         raise _Forbidden(f"open for writing: {arguments!r:.200}")
 
 
-def _peak_memory() -> int:
+def peak_memory() -> int:
     """Return the peak memory of this process, bytes; 0 where the system does not report it."""
     try:
         import resource

@@ -10,24 +10,25 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 from typing_extensions import Self
 
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import CanonicalGrid, PresetWeights
-from snarfcli.errors import UserError
+from snarfcli.descriptions import check_plain, read_described
+from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.files import write_tensors
 from snarfcli.models.back_d import BackD
 from snarfcli.models.back_lbs import BackLBS
 from snarfcli.models.checkpoint import load_checkpoint
+from snarfcli.models.described_sizes import check_described_sizes
 from snarfcli.models.fast_snarf import FastSnarf
 from snarfcli.models.nasa import Nasa
 from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.smpl_nn import SmplNN
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
+from snarfcli.texts import one_line
 
 __all__ = ["SYSTEMS", "TrainedField"]
 
@@ -45,8 +46,8 @@ SYSTEMS: dict[str, type[System]] = {
 }
 """The systems by name, see `ModelConfig.name`."""
 
-_WRONG_CONTENT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError, MemoryError)
-_WRONG_CONTENT += (OmegaConfBaseException,)  # what a damaged description raises
+_WRONG_CONTENT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError)
+_FARTHEST_M = 1e5
 
 T = TypeVar("T")
 
@@ -126,21 +127,38 @@ class TrainedField:
             UserError: the content does not describe an avatar.
         """
         try:
-            merged = OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"])
-            config = cast("AvatarConfig", OmegaConf.to_object(merged))
-            grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
-            skeleton = Skeleton.from_dict(content["skeleton"])
-            template = _read_template(content.get("template"), config.model.name, skeleton.num_joints)
-            field = None
-            if config.skinning.name == "preset" and config.model.name == "fast_snarf":
-                width, height, depth = config.skinning.resolution
-                field = PresetWeights.placeholder(grid, (depth, height, width), skeleton.num_joints)
-            avatar = cls(config, skeleton, grid, facts=content["facts"], field=field, template=template)
-            avatar.model.load_state_dict(content["state"])
+            avatar = cls._built(content)
         except _WRONG_CONTENT as error:
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            if is_out_of_memory(error):
+                raise MemoryError(f"not enough memory to load {path}; close other programs") from None
+            reason = f"no {error}" if isinstance(error, KeyError) else one_line(error, 300)
             raise UserError(f"{path} does not describe an avatar of this version ({reason}); train it again") from None
         avatar.model.eval()
+        return avatar
+
+    @classmethod
+    def _built(cls, content: dict[str, Any]) -> Self:
+        """Return the avatar of a description, which may be from any file: it is checked before anything is built.
+
+        Raises:
+            LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError: it does not describe an avatar.
+        """
+        config = read_described(AvatarConfig, content["config"], "config")
+        if config.model.name not in SYSTEMS:
+            raise ValueError(f"model.name: wanted one of {', '.join(SYSTEMS)}, got {config.model.name!r:.60}")
+        check_plain(content["facts"], "facts")
+        skeleton = Skeleton.from_dict(content["skeleton"])
+        lower, upper = (_read_tensor(content["grid"][name], f"grid.{name}", (3,)) for name in ("lower", "upper"))
+        grid = CanonicalGrid(lower, upper)
+        template = _read_template(content.get("template"), config.model.name, skeleton.num_joints)
+        state = _read_state(content["state"])
+        check_described_sizes(config, skeleton.num_joints, grid, state)
+        field = None
+        if config.skinning.name == "preset" and config.model.name == "fast_snarf":
+            width, height, depth = config.skinning.resolution
+            field = PresetWeights.placeholder(grid, (depth, height, width), skeleton.num_joints)
+        avatar = cls(config, skeleton, grid, facts=dict(content["facts"]), field=field, template=template)
+        _load_state(avatar.model, state)
         return avatar
 
     def to(self, device: str | torch.device) -> Self:
@@ -274,10 +292,50 @@ def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | 
         if not isinstance(part, Tensor) or part.ndim != 2 or part.shape[1] != columns or not len(part):
             came = list(part.shape) if isinstance(part, Tensor) else type(part).__name__
             raise ValueError(f"template.{name}: wanted shape [V, {columns}], got {came}")
-        if part.dtype != torch.float32 or not bool(part.isfinite().all()):
-            raise ValueError(f"template.{name}: wanted finite numbers of dtype torch.float32")
+        _read_tensor(part, f"template.{name}", tuple(part.shape))
     vertices, weights = (content[name].numpy() for name in ("vertices", "weights"))
     template = MeshTemplate(vertices, np.zeros((0, 3), np.int32), weights)
     if len(template.vertices) != len(template.weights):
         raise ValueError(f"template: {len(template.vertices)} vertices, but weights for {len(template.weights)}")
     return template
+
+
+def _read_tensor(value: Any, name: str, shape: tuple[int, ...]) -> Tensor:
+    """Return a tensor of places or weights in a file.
+
+    Raises:
+        ValueError: it is none, or not float32, of another shape, not finite, or far away.
+    """
+    if not isinstance(value, Tensor) or tuple(value.shape) != shape:
+        came = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(f"{name}: wanted shape {list(shape)}, got {came}")
+    if value.dtype != torch.float32 or not bool((value.abs() < _FARTHEST_M).all()):
+        raise ValueError(f"{name}: wanted finite numbers of dtype torch.float32, below {_FARTHEST_M:g}")
+    return value
+
+
+def _read_state(content: Any) -> dict[str, Tensor]:
+    """Return the tensors of a model in a file.
+
+    Raises:
+        ValueError: there is something else, or a tensor has values that are not finite.
+    """
+    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
+        raise ValueError("state: wanted tensors by name, got something else")
+    for name, value in content.items():
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            count = int((~value.isfinite()).sum())
+            raise ValueError(f"state.{one_line(str(name), 60)}: {count} of {value.numel()} numbers are NaN or infinite")
+    return content
+
+
+def _load_state(model: System, state: dict[str, Tensor]) -> None:
+    """Load the state of a file, whose tensors must have the types of the model's.
+
+    Raises:
+        RuntimeError, ValueError: the state does not fit the model.
+    """
+    for name, own in model.state_dict().items():
+        if name in state and state[name].dtype != own.dtype:
+            raise ValueError(f"state.{name}: wanted dtype {own.dtype}, got {state[name].dtype}")
+    model.load_state_dict(state)

@@ -23,6 +23,7 @@ from snarfcli.models.back_lbs import BackLBS
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.described_sizes import check_described_sizes
 from snarfcli.models.fast_snarf import FastSnarf
+from snarfcli.models.file_tensors import load_state, read_state, read_tensor
 from snarfcli.models.nasa import Nasa
 from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
@@ -148,17 +149,19 @@ class TrainedField:
             raise ValueError(f"model.name: wanted one of {', '.join(SYSTEMS)}, got {config.model.name!r:.60}")
         check_plain(content["facts"], "facts")
         skeleton = Skeleton.from_dict(content["skeleton"])
-        lower, upper = (_read_tensor(content["grid"][name], f"grid.{name}", (3,)) for name in ("lower", "upper"))
+        lower, upper = (
+            read_tensor(content["grid"][name], f"grid.{name}", (3,), below=_FARTHEST_M) for name in ("lower", "upper")
+        )
         grid = CanonicalGrid(lower, upper)
         template = _read_template(content.get("template"), config.model.name, skeleton.num_joints)
-        state = _read_state(content["state"])
+        state = read_state(content["state"])
         check_described_sizes(config, skeleton.num_joints, grid, state)
         field = None
         if config.skinning.name == "preset" and config.model.name == "fast_snarf":
             width, height, depth = config.skinning.resolution
             field = PresetWeights.placeholder(grid, (depth, height, width), skeleton.num_joints)
         avatar = cls(config, skeleton, grid, facts=dict(content["facts"]), field=field, template=template)
-        _load_state(avatar.model, state)
+        load_state(avatar.model, state)
         return avatar
 
     def to(self, device: str | torch.device) -> Self:
@@ -288,54 +291,9 @@ def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | 
     if not isinstance(content, dict):
         raise ValueError(f"model {model} needs a template, got {type(content).__name__}")
     for name, columns in (("vertices", 3), ("weights", num_joints)):
-        part = content[name]
-        if not isinstance(part, Tensor) or part.ndim != 2 or part.shape[1] != columns or not len(part):
-            came = list(part.shape) if isinstance(part, Tensor) else type(part).__name__
-            raise ValueError(f"template.{name}: wanted shape [V, {columns}], got {came}")
-        _read_tensor(part, f"template.{name}", tuple(part.shape))
+        read_tensor(content[name], f"template.{name}", (None, columns), below=_FARTHEST_M)
     vertices, weights = (content[name].numpy() for name in ("vertices", "weights"))
     template = MeshTemplate(vertices, np.zeros((0, 3), np.int32), weights)
-    if len(template.vertices) != len(template.weights):
+    if not len(template.vertices) or len(template.vertices) != len(template.weights):
         raise ValueError(f"template: {len(template.vertices)} vertices, but weights for {len(template.weights)}")
     return template
-
-
-def _read_tensor(value: Any, name: str, shape: tuple[int, ...]) -> Tensor:
-    """Return a tensor of places or weights in a file.
-
-    Raises:
-        ValueError: it is none, or not float32, of another shape, not finite, or far away.
-    """
-    if not isinstance(value, Tensor) or tuple(value.shape) != shape:
-        came = list(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise ValueError(f"{name}: wanted shape {list(shape)}, got {came}")
-    if value.dtype != torch.float32 or not bool((value.abs() < _FARTHEST_M).all()):
-        raise ValueError(f"{name}: wanted finite numbers of dtype torch.float32, below {_FARTHEST_M:g}")
-    return value
-
-
-def _read_state(content: Any) -> dict[str, Tensor]:
-    """Return the tensors of a model in a file.
-
-    Raises:
-        ValueError: there is something else, or a tensor has values that are not finite.
-    """
-    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
-        raise ValueError("state: wanted tensors by name, got something else")
-    for name, value in content.items():
-        if value.is_floating_point() and not bool(value.isfinite().all()):
-            count = int((~value.isfinite()).sum())
-            raise ValueError(f"state.{one_line(str(name), 60)}: {count} of {value.numel()} numbers are NaN or infinite")
-    return content
-
-
-def _load_state(model: System, state: dict[str, Tensor]) -> None:
-    """Load the state of a file, whose tensors must have the types of the model's.
-
-    Raises:
-        RuntimeError, ValueError: the state does not fit the model.
-    """
-    for name, own in model.state_dict().items():
-        if name in state and state[name].dtype != own.dtype:
-            raise ValueError(f"state.{name}: wanted dtype {own.dtype}, got {state[name].dtype}")
-    model.load_state_dict(state)

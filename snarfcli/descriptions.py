@@ -19,7 +19,7 @@ from snarfcli.texts import one_line
 __all__ = ["DescriptionError", "check_plain", "read_described"]
 
 _MOST_DEPTH = 20
-_MOST_ENTRIES = 100_000
+_MOST_ENTRIES = 1_000_000
 _LONGEST_TEXT = 100_000
 _MOST_NUMBER = 2**63
 _MISSING = "???"  # OmegaConf's mark of a value that must be given

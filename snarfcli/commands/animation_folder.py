@@ -9,8 +9,10 @@ from typing import Any
 from snarfcli import names
 from snarfcli.commands.animate_settings import AnimateConfig
 from snarfcli.commands.selection import SelectedMotion
+from snarfcli.descriptions import DescriptionError, check_plain
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
+from snarfcli.texts import one_line
 
 __all__ = ["POSTER", "RECORD", "VIDEO", "folder_name", "frame_settings", "prepare_folder"]
 
@@ -55,12 +57,13 @@ def prepare_folder(folder: Path, settings: dict[str, Any], overwrite: bool) -> N
     if record.exists() and not overwrite:
         content = read_json(record, "record of an animation")
         old = content.get("settings") if isinstance(content, dict) else None
-        if not isinstance(old, dict):
+        if not _is_settings(old):
             raise UserError(f"{record} is not the record of an animation; give overwrite=true to replace it, or output=FOLDER")
     if old is not None:
         changed = [name for name, value in settings.items() if old.get(name) != value]
         if changed:
-            what = ", ".join(f"{name} {old.get(name)} (now {settings[name]})" for name in changed if "sha256" not in name)
+            others = [name for name in changed if "sha256" not in name]
+            what = ", ".join(f"{name} {one_line(str(old.get(name)), 60)} (now {settings[name]})" for name in others)
             what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
             raise UserError(f"{folder} has frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
     else:
@@ -74,3 +77,12 @@ def prepare_folder(folder: Path, settings: dict[str, Any], overwrite: bool) -> N
     for half in (*folder.glob(".frame_*.tmp.*"), *folder.glob(".video.*.tmp.mp4")):
         half.unlink(missing_ok=True)  # of a process that was killed
     write_json(record, {"complete": False, "settings": settings})
+
+
+def _is_settings(content: Any) -> bool:
+    """Return whether content is a dict of plain values by name."""
+    try:
+        check_plain(content, "settings")
+    except DescriptionError:
+        return False
+    return isinstance(content, dict)

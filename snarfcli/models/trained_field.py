@@ -147,7 +147,7 @@ class TrainedField:
         config = read_described(AvatarConfig, content["config"], "config")
         if config.model.name not in SYSTEMS:
             raise ValueError(f"model.name: wanted one of {', '.join(SYSTEMS)}, got {config.model.name!r:.60}")
-        check_plain(content["facts"], "facts")
+        check_plain(content["facts"], "facts", finite=False)
         skeleton = Skeleton.from_dict(content["skeleton"])
         lower, upper = (
             read_tensor(content["grid"][name], f"grid.{name}", (3,), below=_FARTHEST_M) for name in ("lower", "upper")

@@ -313,6 +313,8 @@ def _make_field(
 def _after_load(deformer: ForwardDeformer, incompatible: object) -> None:
     """Update what follows from the state after load_state_dict: the field's box and the nodes of active cells."""
     deformer._frozen = None
+    if not bool(deformer.active_cells.any()):
+        raise ValueError("active_cells: wanted at least one cell, got none")
     deformer._update_active_nodes()
     if isinstance(deformer.field, WeightField):
         deformer.field.set_box(deformer.grid)

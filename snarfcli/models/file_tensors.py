@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from snarfcli.models.system import System
 from snarfcli.texts import one_line
 
-__all__ = ["load_state", "read_state", "read_tensor"]
+__all__ = ["FARTHEST_M", "load_state", "read_state", "read_tensor"]
+
+FARTHEST_M = 1e5
+"""Limit of places in files, metres."""
 
 
 def read_tensor(
@@ -55,7 +59,7 @@ def read_state(content: Any) -> dict[str, Tensor]:
     return content
 
 
-def load_state(model: nn.Module, state: dict[str, Tensor]) -> None:
+def load_state(model: System, state: dict[str, Tensor]) -> None:
     """Load the state of a file, whose tensors must have the types of the model's.
 
     Raises:
@@ -64,7 +68,13 @@ def load_state(model: nn.Module, state: dict[str, Tensor]) -> None:
     for name, own in model.state_dict().items():
         if name in state and state[name].dtype != own.dtype:
             raise ValueError(f"state.{name}: wanted dtype {own.dtype}, got {state[name].dtype}")
+    for name, _ in model.named_buffers():  # places and sizes, unlike parameters
+        if name in state and state[name].is_floating_point() and not bool((state[name].abs() < FARTHEST_M).all()):
+            raise ValueError(f"state.{name}: wanted numbers below {FARTHEST_M:g}, got others")
+    box = model.grid.lower.clone(), model.grid.upper.clone()
     model.load_state_dict(state)
+    if not (torch.equal(box[0], model.grid.lower) and torch.equal(box[1], model.grid.upper)):
+        raise ValueError("state: its canonical box is another than that of the avatar")
 
 
 def _shown(shape: Sequence[int | None]) -> str:

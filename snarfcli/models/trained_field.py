@@ -15,6 +15,7 @@ from typing_extensions import Self
 
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import CanonicalGrid, PresetWeights
+from snarfcli.deformer.search_config import check_search_config
 from snarfcli.descriptions import check_plain, read_described
 from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.files import write_tensors
@@ -23,7 +24,7 @@ from snarfcli.models.back_lbs import BackLBS
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.described_sizes import check_described_sizes
 from snarfcli.models.fast_snarf import FastSnarf
-from snarfcli.models.file_tensors import load_state, read_state, read_tensor
+from snarfcli.models.file_tensors import FARTHEST_M, load_state, read_state, read_tensor
 from snarfcli.models.nasa import Nasa
 from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
@@ -48,7 +49,6 @@ SYSTEMS: dict[str, type[System]] = {
 """The systems by name, see `ModelConfig.name`."""
 
 _WRONG_CONTENT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError)
-_FARTHEST_M = 1e5
 
 T = TypeVar("T")
 
@@ -150,7 +150,7 @@ class TrainedField:
         check_plain(content["facts"], "facts", finite=False)
         skeleton = Skeleton.from_dict(content["skeleton"])
         lower, upper = (
-            read_tensor(content["grid"][name], f"grid.{name}", (3,), below=_FARTHEST_M) for name in ("lower", "upper")
+            read_tensor(content["grid"][name], f"grid.{name}", (3,), below=FARTHEST_M) for name in ("lower", "upper")
         )
         grid = CanonicalGrid(lower, upper)
         template = _read_template(content.get("template"), config.model.name, skeleton.num_joints)
@@ -161,6 +161,8 @@ class TrainedField:
             width, height, depth = config.skinning.resolution
             field = PresetWeights.placeholder(grid, (depth, height, width), skeleton.num_joints)
         avatar = cls(config, skeleton, grid, facts=dict(content["facts"]), field=field, template=template)
+        if avatar.model.search is not None:
+            check_search_config(avatar.model.search, skeleton.num_joints)
         load_state(avatar.model, state)
         return avatar
 
@@ -291,7 +293,7 @@ def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | 
     if not isinstance(content, dict):
         raise ValueError(f"model {model} needs a template, got {type(content).__name__}")
     for name, columns in (("vertices", 3), ("weights", num_joints)):
-        read_tensor(content[name], f"template.{name}", (None, columns), below=_FARTHEST_M)
+        read_tensor(content[name], f"template.{name}", (None, columns), below=FARTHEST_M)
     vertices, weights = (content[name].numpy() for name in ("vertices", "weights"))
     template = MeshTemplate(vertices, np.zeros((0, 3), np.int32), weights)
     if not len(template.vertices) or len(template.vertices) != len(template.weights):

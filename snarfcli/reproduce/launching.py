@@ -153,13 +153,7 @@ def run_planned_job(plan: Path, number: int) -> None:
     Raises:
         UserError: the plan or the job does not exist.
     """
-    try:
-        content = read_described(_PlannedJobs, read_json(plan, "plan"), "plan", ignore_unknown=True)
-    except DescriptionError as error:
-        raise UserError(f"plan {plan} is damaged ({error}); use a plan that snarf reproduce has written") from None
-    if not 0 <= number < len(content.jobs) or (content.slots is not None and not 0 < content.slots <= _MOST_SLOTS):
-        raise UserError(f"plan {plan} has no job {number}; use a plan that snarf reproduce has written")
-    job, slots = content.jobs[number], content.slots
+    job, slots = read_planned_job(plan, number)
     result, stop = plan.with_name(f"{number}.json"), plan.with_name("stop")
 
     def begin() -> JobStatus:
@@ -176,6 +170,21 @@ def run_planned_job(plan: Path, number: int) -> None:
     except Exception as error:  # a fault of the program or a full disk; the other jobs still run
         status = JobStatus("failed", job.digest, stage="reproduce", reason=f"{type(error).__name__}: {one_line(error)}")
     write_json(result, asdict(status))
+
+
+def read_planned_job(plan: Path, number: int) -> tuple[Job, int | None]:
+    """Return a job of the plan in a file, and how many jobs may run at a time; None for any number.
+
+    Raises:
+        UserError: the plan or the job does not exist, or the plan is damaged.
+    """
+    try:
+        content = read_described(_PlannedJobs, read_json(plan, "plan"), "plan", ignore_unknown=True)
+    except DescriptionError as error:
+        raise UserError(f"plan {plan} is damaged ({error}); use a plan that snarf reproduce has written") from None
+    if not 0 <= number < len(content.jobs) or (content.slots is not None and not 0 < content.slots <= _MOST_SLOTS):
+        raise UserError(f"plan {plan} has no job {number}; use a plan that snarf reproduce has written")
+    return content.jobs[number], content.slots
 
 
 def _arguments(work: Path, count: int, launcher: Launcher) -> list[str]:

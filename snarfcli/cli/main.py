@@ -17,6 +17,7 @@ from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.overrides import check_overrides, in_brackets
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
+from snarfcli.texts import terminal_text
 
 __all__ = ["COMMANDS", "Command", "main"]
 
@@ -71,7 +72,7 @@ def _report(command: Command, error: Exception) -> int:
     message = user_message(error)
     if message is None:
         raise error
-    print(f"snarf {command.name}: {message}", file=sys.stderr)
+    print(terminal_text(f"snarf {command.name}: {message}"), file=sys.stderr)
     return EXIT_USER_ERROR
 
 
@@ -139,8 +140,17 @@ def _shown() -> list[str]:
     return [name for name, command in COMMANDS.items() if not command.is_hidden]
 
 
+class _Visible(logging.Formatter):
+    """Messages whose control characters are visible: names from files are among them."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return terminal_text(super().format(record))
+
+
 def _set_up_logging() -> None:
     """Print the program's own messages on standard output, without time or level."""
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", stream=sys.stdout)
+    handler = logging.StreamHandler(sys.stdout)
+    handler.setFormatter(_Visible("%(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
     logging.getLogger("snarfcli").setLevel(logging.INFO)
     logging.raiseExceptions = False  # no trace when the reader of the output has ended, as in "| head"

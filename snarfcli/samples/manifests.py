@@ -18,6 +18,7 @@ __all__ = ["check_manifest", "is_sequence"]
 
 _MOST_POINTS = 2**40  # of a sequence
 _MOST_RATE = 1e6
+_LONGEST_NAME = 255
 
 
 @dataclass
@@ -61,6 +62,10 @@ def check_manifest(content: Any, folder: Path) -> None:
         places = [(sequence.split, sequence.name) for sequence in manifest.sequences]
         for index, sequence in enumerate(manifest.sequences):
             _check_sequence(sequence, f"manifest.json.sequences[{index}]")
+        for name in ("data", "subject"):
+            value = getattr(manifest, name)
+            if not value.isprintable() or len(value) > _LONGEST_NAME:
+                raise DescriptionError(f"manifest.json.{name}: wanted a short printable name, got {value!r:.60}")
         if not places or len(set(places)) < len(places):
             raise DescriptionError("manifest.json.sequences: wanted different sequences, at least one")
     except DescriptionError as error:
@@ -83,7 +88,12 @@ def _check_sequence(sequence: _Sequence, where: str) -> None:
         DescriptionError: one is out of range.
     """
     name = sequence.name
-    if name in ("", ".", "..") or not name.isprintable() or any(letter in name for letter in "/\\:"):
+    if (
+        name in ("", ".", "..")
+        or not name.isprintable()
+        or len(name) > _LONGEST_NAME
+        or any(letter in name for letter in "/\\:")
+    ):
         raise DescriptionError(f"{where}.name: wanted the name of a folder, got {name!r:.60}")
     if sequence.split not in SPLITS:
         raise DescriptionError(f"{where}.split: wanted one of {', '.join(SPLITS)}, got {sequence.split!r:.60}")

@@ -24,7 +24,7 @@ def _avatar_target(name: str, read: Callable[[Path], object]) -> Target:
     from tiny_avatars import KINDS, saved, tiny_avatar
     from tree_damage import damaged_torch
 
-    return Target(name, ".pt", lambda: [saved(tiny_avatar(kind).to_dict()) for kind in KINDS], read, damaged_torch, 0.8)
+    return Target(name, ".pt", lambda: [saved(tiny_avatar(kind).to_dict()) for kind in KINDS], read, damaged_torch, 0.8, cost=4)
 
 
 def avatar() -> Target:
@@ -117,7 +117,7 @@ def checkpoint() -> Target:
         again.restore(load_checkpoint(path, CHECKPOINT_FORMAT, CHECKPOINT_VERSION, "checkpoint"), str(path))
         return again.advance()
 
-    return Target("checkpoint", ".pt", seeds, read, damaged_torch, 0.8)
+    return Target("checkpoint", ".pt", seeds, read, damaged_torch, 0.8, cost=4)
 
 
 def _packed(folder: Path) -> bytes:
@@ -190,7 +190,9 @@ def _describe_again(files: dict[str, bytes]) -> None:
 
 
 def _samples_target(name: str, read: Callable[[Path], object]) -> Target:
-    return Target(name, ".samples", lambda: [_packed(_toy_samples()[0])], read, _damaged_samples, unpack=_unpack_samples)
+    return Target(
+        name, ".samples", lambda: [_packed(_toy_samples()[0])], read, _damaged_samples, cost=4, unpack=_unpack_samples
+    )
 
 
 def samples() -> Target:

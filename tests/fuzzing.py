@@ -52,6 +52,8 @@ class Target:
     """Damage a seed file with knowledge of its format: wrong shapes, other types, cycles."""
     extra_share: float = 0.4
     """Share of the files that `extra` damages. Other damage rarely gets beyond the checksums of an archive."""
+    cost: int = 1
+    """How many files of a fast reader take as long as one of this reader; so many fewer are read."""
     unpack: Callable[[bytes, Path], Path] | None = None
     """Write the files that the bytes stand for below a folder and return the path to read, for a reader of a folder. All damage
     is that of `extra` then."""

@@ -38,7 +38,7 @@ def damaged_tree(rng: random.Random, tree: Any) -> Any:
             owner = owner[key]
             key = rng.choice(list(owner)) if isinstance(owner, dict) else rng.randrange(len(owner))
         if key == "":
-            return rng.choice(_WORDS)
+            return copy.deepcopy(rng.choice(_WORDS))
         _change(rng, owner, key)
     return tree
 
@@ -51,7 +51,7 @@ def _change(rng: random.Random, owner: Any, key: Any) -> None:
     elif action < 0.12:
         del owner[key]
     elif action < 0.2 and isinstance(owner, list):
-        owner.extend([owner[key]] * rng.choice([1, 2, 1000]))
+        owner.extend(copy.deepcopy(owner[key]) for _ in range(rng.choice([1, 2, 1000])))
     elif action < 0.2 and isinstance(owner, dict):
         owner[rng.choice([*owner, "extra", "\x1b[31m", "idle", "template", 3])] = owner.pop(key)
     elif action < 0.35:
@@ -59,7 +59,7 @@ def _change(rng: random.Random, owner: Any, key: Any) -> None:
     elif action < 0.5 and isinstance(owner[key], (int, float)) and not isinstance(owner[key], bool):
         owner[key] = type(owner[key])(owner[key] * rng.choice([-1, 2, 10, 1000])) + rng.choice([-1, 0, 1])
     else:
-        owner[key] = rng.choice(_WORDS if rng.random() < 0.95 else _LONG_WORDS)
+        owner[key] = copy.deepcopy(rng.choice(_WORDS if rng.random() < 0.95 else _LONG_WORDS))
 
 
 def _damaged_tensor(rng: random.Random, tensor: torch.Tensor) -> Any:

@@ -168,7 +168,8 @@ def _frame_arrays(path: Path, num_frames: int) -> dict[str, np.ndarray]:
             ("cube_lower", (3,)), ("cube_size", ()), ("box_lower", (3,)), ("box_upper", (3,)),
         ):  # fmt: skip
             checked_array(arrays, name, np.float32, (num_frames, *shape), least=0.0 if name == "cube_size" else None)
-        checked_array(arrays, "frame_numbers", np.int64, (num_frames,), least=0)
+        if (np.diff(checked_array(arrays, "frame_numbers", np.int64, (num_frames,), least=0)) <= 0).any():
+            raise ValueError("frame_numbers: wanted rising numbers, got others")
         topology = checked_array(arrays, "topology", np.int64, (num_frames,), least=0)
         _check_starts(arrays, "vertex_start", num_frames)
         _check_starts(arrays, "face_start", 1 + int(topology.max()))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError
 from snarfcli.samples.layout import FORMAT_VERSION, samples_folder
 from snarfcli.samples.sequence import SequenceSamples
@@ -273,3 +276,57 @@ def test_a_folder_is_held_by_one(tmp_path: Path) -> None:
             pass
     with hold_folder(tmp_path / "a"):
         pass
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EMFILE, errno.EIO])
+@pytest.mark.parametrize("name", ["frames.npz", "points.npy"])
+def test_errors_of_the_system_are_not_damage(folder: Path, number: int, name: str, monkeypatch) -> None:
+    def failing(path: Path, *arguments, **more):
+        if path.name == name:
+            raise OSError(number, os.strerror(number), str(path))
+        return opened(path, *arguments, **more)
+
+    opened = Path.open
+    monkeypatch.setattr(Path, "open", failing)
+    with pytest.raises(OSError, match=os.strerror(number)) as caught:
+        _open(folder)
+    assert name in caught.value.filename
+    message = user_message(caught.value)
+    assert "delete" not in message
+    assert "overwrite" not in message
+
+
+def test_frames_in_another_order_are_damage(folder: Path) -> None:
+    path = folder / "test" / "hop" / "frames.npz"
+    arrays = dict(np.load(path))
+    arrays["frame_numbers"] = arrays["frame_numbers"][::-1].copy()
+    write_arrays(path, arrays)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for sequence in manifest["sequences"]:
+        if sequence["name"] == "hop":
+            sequence["files"]["frames.npz"]["bytes"] = path.stat().st_size
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=r"the samples are damaged: .*frames\.npz: frame_numbers: wanted rising numbers"):
+        _open(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m["sequences"][0].update(name="../../../etc"), r"sequences\[0\]\.name: wanted the name of a folder"),
+        (lambda m: m["sequences"][0].update(split="all"), r"sequences\[0\]\.split: wanted one of train, test, ood"),
+        (lambda m: m["sequences"][0].update(frames=-1), r"sequences\[0\]: wanted frames of a multiple of 8 points"),
+        (lambda m: m["sequences"][0].update(frame_rate="fast"), r"sequences\[0\]\.frame_rate: wanted a number, got 'fast'"),
+        (lambda m: m["sequences"].append(m["sequences"][0]), "wanted different sequences, at least one"),
+        (lambda m: m["files"].update({"../x": m["files"]["subject.npz"]}), r"files: wanted subject\.npz, got other names"),
+        (lambda m: m.update(subject="\x1b[2J"), r"subject: wanted a short printable name"),
+        (lambda m: m.pop("sequences"), r"sequences: wanted a value, got none"),
+    ],
+)
+def test_a_damaged_manifest_is_named(folder: Path, change, message: str) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=f"are damaged: .*{message}") as caught:
+        _open(folder)
+    assert str(caught.value).isprintable()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -24,11 +25,13 @@ __all__ = [
     "MAX_ARRAY_BYTES",
     "atomic_path",
     "file_digest",
+    "flush_to_disk",
     "list_npz",
     "map_npy",
     "read_json",
     "read_npy",
     "read_npz",
+    "remove_temporaries",
     "write_arrays",
     "write_json",
     "write_tensors",
@@ -36,6 +39,7 @@ __all__ = [
 
 MAX_ARRAY_BYTES = 2**30
 """Maximum total size of the arrays in one file, unless a reader sets another."""
+_TEMPORARY = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp((?:\.[^.]*)?)")
 # Deflate compresses at most about 1030 to 1. Arrays of zeros, such as unused hands, come close, but no large file as a whole.
 _BOMB_BYTES = 2**26
 _BOMB_RATIO = 500
@@ -58,7 +62,8 @@ def file_digest(path: Path) -> str:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; it replaces `path` if the block succeeds and is deleted if it fails.
 
-    Parent folders are created. The temporary name keeps the suffix, by which many writers choose the format.
+    Parent folders are created. The temporary name keeps the suffix, by which many writers choose the format. The content is
+    on the disk before the name changes, so that a power cut leaves the old file or the new one.
 
     Raises:
         OSError: the file cannot be written. It names `path`, also for a full disk, where the system names no file.
@@ -68,13 +73,49 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.tmp{path.suffix}")
     try:
         yield temporary
+        flush_to_disk(temporary)
         os.replace(temporary, path)
+        flush_to_disk(path.parent)
     except OSError as error:
         if error.errno is not None and error.filename in (None, str(temporary)):
             error.filename = str(path)
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_temporaries(folder: Path, *names: str) -> None:
+    """Delete what killed processes have left of files that `atomic_path` was writing in a folder.
+
+    Only the holder of the folder's lock may do so: the files of a running process look alike.
+
+    Args:
+        folder: the folder, which need not exist.
+        names: names of the files that were being written; any if none is given.
+    """
+    for path in folder.iterdir() if folder.is_dir() else ():
+        match = _TEMPORARY.fullmatch(path.name)
+        if match and (not names or match[1] + match[2] in names):
+            path.unlink(missing_ok=True)
+
+
+def flush_to_disk(path: Path) -> None:
+    """Wait until the content of a file, or the names in a folder, are on the disk, where the system can tell.
+
+    Raises:
+        OSError: the disk is full, or reports an error.
+    """
+    is_folder = path.is_dir()
+    if is_folder and os.name != "posix":
+        return
+    descriptor = os.open(path, os.O_RDONLY if is_folder else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS):  # some file systems of networks
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def write_json(path: str | Path, content: Any) -> None:

@@ -1,32 +1,187 @@
-"""Locks between processes: two of them never write the same samples or train the same run at the same time."""
+"""Locks between processes: one output folder has one writer at a time, and its child processes count as the writer too.
+
+DESIGN. A lock is a hidden file beside the folder (not in it: folders are replaced as a whole), locked by the system, so that it
+is free as soon as its holder has ended, however it ended. Child processes inherit the lock: when the holder is killed, the lock
+stays until its children, which may still write, have ended too. A second file says who holds the lock. It only serves messages.
+"""
 
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import os
+import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import datetime
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
-__all__ = ["locked", "one_of", "try_lock"]
+from snarfcli.errors import UserError
+from snarfcli.texts import one_line
+
+__all__ = [
+    "clear_killed",
+    "hold_all_inside",
+    "hold_output",
+    "holder_is_gone",
+    "inherited_locks",
+    "lock_file",
+    "locked",
+    "one_of",
+    "try_lock",
+]
 
 log = logging.getLogger(__name__)
 
 _LOOK_EVERY_S = 0.3
+_TELL_EVERY_S = 60.0
+# How long the children of a killed process may take to notice it and end.
+_PATIENCE_S = 20.0
 # What file systems without locks answer, such as Lustre, NFS and shared folders mounted without them.
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+_held: set[int] = set()
+
+
+@contextmanager
+def hold_output(output: str | Path, command: str, *, wait: bool = False) -> Iterator[None]:
+    """Hold the lock of an output folder, or of an output file, while the block writes there.
+
+    Args:
+        output: the folder or file; its parent folders are created, and deleted again if nothing was written there.
+        command: who holds it, for the message that another process gets, such as "snarf train".
+        wait: whether to wait while another process holds it.
+
+    Raises:
+        UserError: another process holds it and `wait` is false; the message says which one and since when.
+        OSError: the lock cannot be created.
+    """
+    output = Path(os.path.realpath(output))
+    path, about = lock_file(output), _about(output)
+    new_folders = [folder for folder in output.parents if not folder.exists()]
+    release = try_lock(path)
+    if release is None:
+        release = _await(path, about, output, wait)
+    try:
+        with suppress(OSError):  # a full disk, which the work itself will report
+            about.write_text(json.dumps(_myself(command)))
+        yield
+    finally:
+        with suppress(OSError):
+            about.unlink(missing_ok=True)
+        release()
+        with suppress(OSError):  # not empty
+            for folder in new_folders:
+                folder.rmdir()
+
+
+def clear_killed(output: str | Path) -> None:
+    """Delete the lock of an output whose holder was killed, for commands that then find that there is nothing left to do."""
+    if lock_file(Path(os.path.realpath(output))).exists():
+        with suppress(UserError), hold_output(output, ""):
+            pass
+
+
+def holder_is_gone(output: Path) -> bool:
+    """Return whether the process that held the lock of an output has been killed; False if that cannot be known."""
+    return _is_gone(_read(_about(output)))
+
+
+@contextmanager
+def hold_all_inside(folder: Path) -> Iterator[None]:
+    """Hold the locks of all outputs below a folder, which the block deletes.
+
+    Raises:
+        UserError: another process holds one.
+    """
+    with ExitStack() as held:
+        for path in sorted(folder.rglob(".*.lock")):
+            release = try_lock(path)
+            if release is None:
+                output = path.with_name(path.name[1:].removesuffix(".lock"))
+                holder = _described(_read(_about(output)))
+                raise UserError(f"{output} is in use {holder}; wait until it ends, or give another folder, or end it")
+            held.callback(release)
+        yield
+
+
+def lock_file(output: Path) -> Path:
+    """Return the file whose lock `hold_output` holds."""
+    return output.with_name(f".{output.name}.lock")
+
+
+def _about(output: Path) -> Path:
+    """Return the file that says who holds the lock of an output."""
+    return output.with_name(f".{output.name}.holder.json")
+
+
+def _await(path: Path, about: Path, output: Path, wait: bool) -> Callable[[], None]:
+    """Wait for the lock of an output, without `wait` only for what is about to end, and return the function that unlocks it."""
+    start, told = time.monotonic(), -_TELL_EVERY_S
+    while True:
+        holder = _read(about)
+        waited = time.monotonic() - start
+        is_ending = waited < (_PATIENCE_S if _is_gone(holder) else 1.0)  # or has just begun and not yet said who it is
+        if not wait and not (is_ending and (holder is None or _is_gone(holder))):
+            raise UserError(f"{output} is in use {_described(holder)}; wait until it ends, or give wait=true, or end it")
+        if wait and waited - told >= _TELL_EVERY_S and not is_ending:
+            log.info("waiting: %s is in use %s", output, _described(holder))
+            told = waited
+        time.sleep(_LOOK_EVERY_S)
+        release = try_lock(path)
+        if release is not None:
+            return release
+
+
+def _myself(command: str) -> dict[str, Any]:
+    """Return what the file beside a lock says."""
+    since = datetime.now().astimezone().isoformat(timespec="seconds")
+    return {"command": command, "pid": os.getpid(), "host": socket.gethostname(), "since": since}
+
+
+def _read(about: Path) -> dict[str, Any] | None:
+    """Return who holds a lock, None if it is not known."""
+    with suppress(OSError, ValueError, RecursionError):
+        content = json.loads(about.read_text()[:10000])
+        if isinstance(content, dict) and all(isinstance(content.get(key), str) for key in ("command", "host", "since")):
+            return content if isinstance(content.get("pid"), int) else None
+    return None
+
+
+def _is_gone(holder: dict[str, Any] | None) -> bool:
+    """Return whether a holder has ended without a word, as after `kill -9`; only known for processes of this machine."""
+    if holder is None or holder["host"] != socket.gethostname() or os.name != "posix":
+        return False
+    try:
+        os.kill(holder["pid"], 0)
+    except ProcessLookupError:
+        return True
+    except (OSError, OverflowError):
+        return False
+    return False
+
+
+def _described(holder: dict[str, Any] | None) -> str:
+    """Return who holds a lock, as the end of "is in use"."""
+    if holder is None:
+        return "by another process"
+    command, host, since = (one_line(holder[key], 60) for key in ("command", "host", "since"))
+    where = "" if host == socket.gethostname() else f" on {host}"
+    if _is_gone(holder):
+        return f"by processes that {command} has started, which was killed{where}"
+    return f"by {command} (process {holder['pid']}{where}, since {since.replace('T', ' ')[:19]})"
 
 
 @contextmanager
 def locked(path: Path, check: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Hold the lock of a file while the block runs; wait while another process holds it.
 
-    The lock is released when its holder ends, including when it is killed.
+    The lock is released when its holder, and the children that inherited it, have ended, including when they are killed.
 
     Args:
         path: the file; it and its folder are created.
@@ -62,19 +217,47 @@ def try_lock(path: Path) -> Callable[[], None] | None:
     Raises:
         OSError: the file cannot be created.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # A soft lock would replace a missing one by a file, which stays when its holder is killed on another machine.
-    lock = FileLock(path, fallback_to_soft=False)
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptors: list[int] = []
+        # A soft lock would replace a missing one by a file, which stays when its holder is killed on another machine.
+        lock = FileLock(path, fallback_to_soft=False, on_acquired=descriptors.append)
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            return None
+        except FileNotFoundError:  # its folder was deleted at this moment
+            continue
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            _warn_once(str(path.parent), error.errno)
+            return lambda: None
+        if _is_still_there(path, descriptors):
+            break
+        lock.release()
+    _held.update(descriptors)
+
+    def release() -> None:
+        _held.difference_update(descriptors)
+        with suppress(OSError):  # while it is locked, see `_is_still_there`; Windows deletes no open file
+            path.unlink()
+        lock.release()
+
+    return release
+
+
+def _is_still_there(path: Path, descriptors: Sequence[int]) -> bool:
+    """Return whether a path is still the file that was locked: its holder deletes it, while another may have opened it."""
     try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        return None
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise
-        _warn_once(str(path.parent), error.errno)
-        return lambda: None
-    return lock.release
+        return all(os.path.samestat(os.fstat(descriptor), path.stat()) for descriptor in descriptors)
+    except OSError:
+        return os.name != "posix"
+
+
+def inherited_locks() -> tuple[int, ...]:
+    """Return the descriptors of the locks that this process holds, to be passed to the child processes that write for it."""
+    return tuple(_held) if os.name == "posix" else ()
 
 
 @cache

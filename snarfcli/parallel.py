@@ -14,23 +14,17 @@ import pickle
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from multiprocessing import reduction
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
 from snarfcli.errors import UserError
+from snarfcli.interrupts import SIGNALS, interrupts_held_back
+from snarfcli.locks import inherited_locks
 
-__all__ = [
-    "Worker",
-    "choose_processes",
-    "count_cores",
-    "end_workers",
-    "interrupts_held_back",
-    "parse_processes",
-    "run_in_processes",
-]
+__all__ = ["Worker", "choose_processes", "count_cores", "end_workers", "parse_processes", "run_in_processes"]
 
-_PATIENCE_S = 10.0  # between SIGTERM and SIGKILL; writing a large mesh takes a second
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 _MOST_PROCESSES = 64
 
@@ -80,8 +74,9 @@ def _free_bytes() -> int:
 class Worker:
     """A fresh single-threaded process that runs a generator function and sends each item that it yields.
 
-    The process ignores SIGINT, which Ctrl-C sends to the whole group; the parent process ends it. When it is ahead of the
-    receiver, it waits as soon as the pipe is full (64 kB on Linux).
+    The process ignores the signals that ask the whole group to end; the parent process ends it. It also ends when the parent
+    is killed, and until then keeps the locks that the parent held (see `locks`). When it is ahead of the receiver, it waits
+    as soon as the pipe is full (64 kB on Linux).
     """
 
     def __init__(
@@ -103,7 +98,7 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self.connection, theirs = context.Pipe(duplex=has_requests)
         work = pickle.dumps((function, task))  # here, so that a failure to read it there is reported like any other
-        self._process = context.Process(target=_serve, args=(theirs, work, has_requests), daemon=True)
+        self._process = context.Process(target=_serve, args=(theirs, work, has_requests, _Locks()), daemon=True)
         self._fewer = fewer
         with _one_thread():
             self._process.start()
@@ -139,13 +134,13 @@ class Worker:
         return kind == "item", item
 
     def end(self) -> None:
-        """End the process, also in the middle of its work, and wait until it has ended."""
-        self.connection.close()  # first: a process that waits in the pipe goes on then, and ends
-        self._process.terminate()
-        self._process.join(_PATIENCE_S)
-        if self._process.is_alive():  # Python received the signal where it ignores exceptions, or hangs in native code
-            self._process.kill()
-            self._process.join()
+        """End the process, also in the middle of its work, and wait until it has ended.
+
+        A file that it was writing stays under its temporary name; the caller deletes it.
+        """
+        self.connection.close()
+        self._process.kill()
+        self._process.join()
 
     def _lost(self) -> UserError:
         self._process.join()
@@ -156,7 +151,7 @@ class Worker:
 
 
 def end_workers(workers: Sequence[Worker]) -> None:
-    """End several workers at the same time: each ends only when it leaves native code."""
+    """End several workers at the same time."""
     threads = [threading.Thread(target=worker.end) for worker in workers]
     for thread in threads:
         thread.start()
@@ -210,10 +205,24 @@ def run_in_processes(
             worker.end()
 
 
-def _serve(connection: Connection, work: bytes, has_requests: bool) -> None:
+class _Locks:
+    """The locks of the parent, which a worker keeps open by receiving them: they are free only when both have ended."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Locks.kept, ([reduction.DupFd(descriptor) for descriptor in inherited_locks()],)
+
+    @staticmethod
+    def kept(sent: Sequence[Any]) -> list[int]:
+        """Take over the descriptors in the worker."""
+        return [descriptor.detach() for descriptor in sent]
+
+
+def _serve(connection: Connection, work: bytes, has_requests: bool, locks: Any) -> None:
     """Run one task in the worker and send each item; the parent decides what a failure means."""
-    with contextlib.suppress(ValueError):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends the workers
+    for number in SIGNALS:  # they reach the whole group; the parent ends the workers
+        with contextlib.suppress(ValueError):
+            signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         function, task = pickle.loads(work)
         for item in function(*task, *([_requests(connection)] if has_requests else [])):
@@ -231,6 +240,14 @@ def _serve(connection: Connection, work: bytes, has_requests: bool) -> None:
         connection.close()
 
 
+def _end_with_parent() -> None:
+    """End this process when its parent has ended, also without a word; it must not go on writing files then."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
 def _requests(connection: Connection) -> Iterator[Any]:
     """Yield what the parent sends until it closes the connection."""
     while True:
@@ -239,19 +256,6 @@ def _requests(connection: Connection) -> Iterator[Any]:
         except (EOFError, ConnectionResetError):
             return
         yield request
-
-
-@contextlib.contextmanager
-def interrupts_held_back() -> Iterator[None]:
-    """Start processes with SIGINT blocked, so that an early Ctrl-C prints no stack trace; this process gets it afterwards."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager

@@ -151,7 +151,7 @@ def _damaged_samples(rng: random.Random, content: bytes) -> bytes:
         elif name.endswith(".npz"):
             try:
                 files[name] = damaged_npz(rng, files[name])
-            except (ValueError, OSError, zipfile.BadZipFile):  # damaged before
+            except (ValueError, EOFError, OSError, zipfile.BadZipFile):  # damaged before
                 files[name] = b""
         else:
             try:

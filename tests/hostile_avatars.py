@@ -159,6 +159,7 @@ def _contents() -> dict[str, Callable[[dict[str, Any]], object]]:
         "facts with a tensor": _sets("facts", "steps", value=torch.zeros(3)),
         "extra key at the top": _sets("_target_", value="os.system"),
         "format of another program": _sets("format", value="\x1b[31mother"),
+        "format a tensor": _sets("format", value=torch.zeros(2)),
         "version as text": _sets("version", value=_SECRET),
         "version of many digits": _sets("version", value=2**62),
         "joint names escape": _sets("skeleton", "names", value=["\x1b[2J", "a\nb", "c"]),

@@ -30,7 +30,6 @@ LAYERS = (
         "files",
         "formats",
         "hydra_config",
-        "locks",
         "native",
         "parallel",
         "precision",
@@ -39,7 +38,8 @@ LAYERS = (
         "sampling",
         "segments",
     ),
-    ("errors", "names", "texts", "versions"),
+    ("locks",),
+    ("errors", "interrupts", "names", "texts", "versions"),
 )
 """Folders and top-level modules of the package, from the top layer down; those of one layer do not import each other."""
 

@@ -10,31 +10,39 @@ from typing import Any
 import msgspec
 import viser
 import zstandard
+from typing_extensions import Self
 from viser import _messages
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
-__all__ = ["Page"]
+from snarfcli.viewer.server import ViewServer
+
+__all__ = ["Client", "Page", "open_socket"]
 
 PATIENCE_S = 300  # only a broken test waits that long, however busy the machine is
 
 
-class Page:
-    """One client of viser's server on this machine."""
+def open_socket(port: int, headers: dict[str, str] | None = None, **changes: Any) -> ClientConnection:
+    """Return a connection as the page opens it: with its own origin and the version of viser."""
+    options: dict[str, Any] = {"origin": f"http://127.0.0.1:{port}", "subprotocols": [f"viser-v{viser.__version__}"], **changes}
+    return connect(f"ws://127.0.0.1:{port}", additional_headers=headers, max_size=None, open_timeout=PATIENCE_S, **options)
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        port, known, came = server.get_port(), set(server.get_clients()), queue.Queue()
-        server.on_client_connect(lambda client: came.put(client.client_id))
-        self._socket = connect(
-            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, open_timeout=PATIENCE_S
-        )
+
+class Client:
+    """One client of a viewer at a port of this machine.
+
+    Args:
+        port: port of the viewer.
+        headers: further headers of the handshake.
+    """
+
+    def __init__(self, port: int, headers: dict[str, str] | None = None) -> None:
+        self._socket = open_socket(port, headers)
         self.messages: list[dict[str, Any]] = []
         self._mark = 0
         self._send(_messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 3), 0.8, 0.1, 100, 480, 640, (0, 0, 0), (0, 1, 0)))
         self.until(lambda message: message["type"] == "ReplayDoneMessage")
-        while came.get(timeout=PATIENCE_S) in known:  # before that the server does not listen
-            pass
 
-    def __enter__(self) -> Page:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -75,13 +83,45 @@ class Page:
         found = [message for message in self.messages if label in _labels(message)]
         return found[number]["uuid"]
 
+    def options(self, label: str) -> list[str]:
+        """Return the options of the dropdown with this label."""
+        return next(
+            message["props"]["options"]
+            for message in self.messages
+            if label in _labels(message) and "options" in message["props"]
+        )
+
+    def markdown(self) -> list[str]:
+        """Return all Markdown that has come."""
+        parts = (message.get(part, {}) for message in self.messages for part in ("props", "updates"))
+        return [part["_markdown"] for part in parts if "_markdown" in part]
+
     def change(self, label: str, value: Any, number: int = 0) -> None:
         """Change an input, or press a button, as a user of the page would."""
         self.expect()
         self._send(_messages.GuiUpdateMessage(self.uuid(label, number), {"value": value}))
 
+    def send(self, message: dict[str, Any]) -> None:
+        """Send any message."""
+        self.send_bytes(msgspec.msgpack.encode(message))
+
+    def send_bytes(self, data: bytes | str) -> None:
+        """Send any data, text as a message of text."""
+        self._socket.send(data)
+
     def _send(self, message: _messages.Message) -> None:
-        self._socket.send(msgspec.msgpack.encode(message.as_serializable_dict([])))
+        self.send(message.as_serializable_dict([]))
+
+
+class Page(Client):
+    """A client of a viewer in this process, which listens to it from the beginning."""
+
+    def __init__(self, server: ViewServer, headers: dict[str, str] | None = None) -> None:
+        known, came = set(server.server.get_clients()), queue.Queue()
+        server.server.on_client_connect(lambda client: came.put(client.client_id))
+        super().__init__(server.port, headers)
+        while came.get(timeout=PATIENCE_S) in known:  # before that the server does not listen
+            pass
 
 
 def _labels(message: dict[str, Any]) -> set[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import logging
 import os
@@ -17,6 +18,7 @@ from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.overrides import check_overrides, in_brackets
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
+from snarfcli.interrupts import exit_code, signals_as_interrupts
 from snarfcli.texts import terminal_text
 
 __all__ = ["COMMANDS", "Command", "main"]
@@ -24,7 +26,6 @@ __all__ = ["COMMANDS", "Command", "main"]
 log = logging.getLogger(__name__)
 
 EXIT_USER_ERROR = 2
-EXIT_INTERRUPTED = 130
 
 # The commands create their run folders themselves: Hydra writes nothing, changes no folder and leaves logging alone.
 _HYDRA_SETTINGS = (
@@ -38,7 +39,12 @@ _HYDRA_SETTINGS = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0, 1 (partly failed), 2 (user error) or 130 (Ctrl-C)."""
+    """Run the command line and return its exit code.
+
+    Returns:
+        0, 1 (partly failed), 2 (user error), 130 (Ctrl-C), 143 (SIGTERM) or 129 (SIGHUP).
+    """
+    _open_standard_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(overview())
@@ -56,10 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     _set_up_logging()
     try:
-        return _run(command, arguments[1:])
-    except KeyboardInterrupt:
-        print(f"snarf {command.name}: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        with signals_as_interrupts():
+            return _run(command, arguments[1:])
+    except KeyboardInterrupt as interrupt:
+        _say(f"snarf {command.name}: interrupted")
+        return exit_code(interrupt)
     except BrokenPipeError:  # the reader of the output has ended, as in "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -72,8 +79,27 @@ def _report(command: Command, error: Exception) -> int:
     message = user_message(error)
     if message is None:
         raise error
-    print(terminal_text(f"snarf {command.name}: {message}"), file=sys.stderr)
+    _say(terminal_text(f"snarf {command.name}: {message}"))
     return EXIT_USER_ERROR
+
+
+def _say(line: str) -> None:
+    """Print a line on standard error, if that still exists: the terminal may be closed."""
+    with contextlib.suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+
+
+def _open_standard_streams() -> None:
+    """Open the null device in place of standard streams that are closed, as services do and `2>&-` does.
+
+    The next file to be opened would otherwise get the number of such a stream, and what libraries print would go into it.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - stays open as long as the process
 
 
 def _run(command: Command, arguments: list[str]) -> int:

@@ -24,7 +24,8 @@ from snarfcli.commands.selection import (
     select_motion,
 )
 from snarfcli.errors import UserError
-from snarfcli.files import write_json
+from snarfcli.files import remove_temporaries, write_json
+from snarfcli.locks import hold_output
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.mesh_files import MESH_WRITERS
@@ -69,11 +70,31 @@ def run(config: AnimateConfig) -> int:
     on_cpu = avatar.device.type == "cpu"
     processes = frame_processes(plan.processes, count, config.resolution, extract=on_cpu, draw=config.video)
     folder = Path(config.output) if config.output else path.parent / "animation" / folder_name(motion.name)
-    settings = frame_settings(config, path, chosen)
-    prepare_folder(folder, settings, config.overwrite)
     log.info("avatar: %s, on %s", path, avatar.device)
     log.info("motion: %s, %d frames at %g per second", motion.name, motion.num_frames, motion.frame_rate)
+    with hold_output(folder, "snarf animate", wait=config.wait):
+        settings = frame_settings(config, path, chosen)
+        prepare_folder(folder, settings, config.overwrite)
+        try:
+            animation, record = _animate(config, plan, avatar, path, chosen, truth, folder, processes)
+        finally:
+            remove_temporaries(folder)  # of worker processes that were ended
+        write_json(folder / RECORD, {"complete": True, "settings": settings, **record})
+    return _report(config, animation, record["timings"])
 
+
+def _animate(
+    config: AnimateConfig,
+    plan: _Plan,
+    avatar: Avatar,
+    path: Path,
+    chosen: SelectedMotion,
+    truth: GroundTruthMeshes | None,
+    folder: Path,
+    processes: int,
+) -> tuple[Animation, dict[str, Any]]:
+    """Write meshes and video of the avatar of the file `path`; return the animation and its record."""
+    motion, count, on_cpu = chosen.motion, len(chosen.numbers), avatar.device.type == "cpu"
     start = time.perf_counter()
     canonical = _canonical(config, avatar)
     animation = Animation(
@@ -107,9 +128,7 @@ def run(config: AnimateConfig) -> int:
         done = len(animation.frames)
         log.info("stopped after %d of %d frames; run the same command to continue", done, count)
         raise
-    record = _record(config, animation, motion, path, processes, time.perf_counter() - start)
-    write_json(folder / RECORD, {"complete": True, "settings": settings, **record})
-    return _report(config, animation, record["timings"])
+    return animation, _record(config, animation, motion, path, processes, time.perf_counter() - start)
 
 
 @dataclass(frozen=True)
@@ -261,7 +280,7 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
         log.info("meshes: %s", folder / f"frame_*.{config.format}")
     if config.video:
         log.info("video: %s, its middle frame: %s", folder / VIDEO, POSTER)
-    pieces = sum(frame.components > 1 for frame in frames)
+    pieces = sum((frame.components or 0) > 1 for frame in frames)
     if pieces:
         log.info("%d frames have loose pieces; keep_share=0.1 removes all but large ones", pieces)
     if skipped:

@@ -53,6 +53,8 @@ class AnimateConfig(MotionSelection, AvatarSelection):
     """Output folder; null for animation/<motion> beside the avatar."""
     overwrite: bool = MISSING
     """Start again and replace existing frames, also those of other settings."""
+    wait: bool = False
+    """Wait while another command writes to the output folder, instead of stopping with an error."""
     processes: str = MISSING
     """Number of processes, which share the threads; auto: one per core if memory allows. With a GPU, one process extracts all
     surfaces and the others only draw."""

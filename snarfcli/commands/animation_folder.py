@@ -11,7 +11,7 @@ from snarfcli.commands.animate_settings import AnimateConfig
 from snarfcli.commands.selection import SelectedMotion
 from snarfcli.descriptions import DescriptionError, check_plain
 from snarfcli.errors import UserError
-from snarfcli.files import read_json, write_json
+from snarfcli.files import read_json, remove_temporaries, write_json
 from snarfcli.texts import one_line
 
 __all__ = ["POSTER", "RECORD", "VIDEO", "check_record", "folder_name", "frame_settings", "prepare_folder"]
@@ -60,8 +60,7 @@ def prepare_folder(folder: Path, settings: dict[str, Any], overwrite: bool) -> N
             )
         for stale in there:
             stale.unlink(missing_ok=True)
-    for half in (*folder.glob(".frame_*.tmp.*"), *folder.glob(".video.*.tmp.mp4")):
-        half.unlink(missing_ok=True)  # of a process that was killed
+    remove_temporaries(folder)
     write_json(folder / RECORD, {"complete": False, "settings": settings})
 
 

@@ -25,8 +25,9 @@ from snarfcli.evaluation.figure import write_figure
 from snarfcli.evaluation.report import SPLITS, STORE_SPLITS, EvaluationReport, metrics_content, table, timings_text
 from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
-from snarfcli.files import write_json
+from snarfcli.files import remove_temporaries, write_json
 from snarfcli.fitting import PoseRefiner, refined_poses_text, require_refinable
+from snarfcli.locks import hold_output
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
@@ -73,6 +74,8 @@ class EvalConfig:
     """Number of worst frames, and of best frames, to draw."""
     figure_resolution: int = MISSING
     """Voxels along the longest side of the meshes in the figure."""
+    wait: bool = False
+    """Wait while another command writes to the output folder, instead of stopping with an error."""
     device: str = MISSING
     """auto, cpu, cuda or cuda:N."""
     threads: int | None = MISSING
@@ -104,15 +107,23 @@ def run(config: EvalConfig) -> None:
             avatar.model.choose_search(with_start_bones(config.search, avatar.skeleton))
         except ValueError as error:
             raise UserError(f"{error}; leave search out, or give search=snarf for an avatar of model=snarf") from None
-    search = avatar.model.search
     folder = path.parent / _folder_name(config, avatar)
     _check_writable(folder)
     log.info(
         "data: %s, subject %s, %s: %d sequences, %d frames",
         store.data, store.subject, SPLITS[config.split], len(sequences), sum(s.num_frames for s in sequences),
     )  # fmt: skip
+    search = avatar.model.search
     log.info("avatar: %s, %s, on %s", path, f"search {search.name}" if search else avatar.config.model.name, device)
 
+    with hold_output(folder, "snarf eval", wait=config.wait):
+        remove_temporaries(folder)
+        _evaluate(config, avatar, path, store, folder)
+
+
+def _evaluate(config: EvalConfig, avatar: Avatar, path: Path, store: SampleStore, folder: Path) -> None:
+    """Measure the avatar of the file `path`, and write the results to a folder."""
+    sequences, search = store.sequences(STORE_SPLITS[config.split]), avatar.model.search
     refined = _refine(config, avatar, store) if config.refine_poses else None
     start = time.perf_counter()
     frames = evaluate(
@@ -131,7 +142,7 @@ def run(config: EvalConfig) -> None:
         frames=frames,
         wall_s=time.perf_counter() - start,
         machine=machine_facts(),
-        device=str(device),
+        device=str(avatar.device),
         training=avatar.facts,
         search=asdict(search) if search else {},
         refined_poses=refined,

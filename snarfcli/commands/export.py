@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from snarfcli.avatar import Avatar
 from snarfcli.commands.export_bvh import write_motions
-from snarfcli.commands.export_places import check_place, clip_files, default_place, read_clips, record_file, subject_name
+from snarfcli.commands.export_places import (
+    check_place,
+    clip_files,
+    default_place,
+    read_clips,
+    subject_name,
+    write_record,
+    writing,
+)
 from snarfcli.commands.export_settings import ExportConfig, check_settings
 from snarfcli.commands.selection import load_selected_avatar
 from snarfcli.errors import UserError
@@ -24,7 +32,6 @@ from snarfcli.export.human_bones import human_bones
 from snarfcli.export.joint_naming import named_joints
 from snarfcli.export.sequence import atomic_folder, write_sequence
 from snarfcli.export.vrm import export_vrm
-from snarfcli.files import write_json
 from snarfcli.meshing.mesh_files import MESH_WRITERS
 from snarfcli.runs import machine_facts, run_folder
 
@@ -65,12 +72,11 @@ def run(config: ExportConfig) -> int:
     log.info("avatar: %s, on %s", path, avatar.device)
     for clip in clips:
         log.info("motion: %s, %d frames at %g per second", clip.motion.name, clip.motion.num_frames, clip.motion.frame_rate)
-    start = time.perf_counter()
+    files = clip_files(config, output, [clip.motion.name for clip in clips], "vrma") if config.format == "vrm" else []
     write = _write_meshes if config.format in MESH_WRITERS else _write_vrm if config.format == "vrm" else _write_character
-    facts, lines, skipped = write(config, avatar, clips, options, output, blender)
-    seconds = round(time.perf_counter() - start, 2)
-    record = {"config": asdict(config), "avatar": str(path), **facts, "seconds": seconds, **machine_facts()}
-    write_json(record_file(config, output), record)
+    job = _Job(config, avatar, path, clips, options, output, files, blender, time.perf_counter())
+    with writing(config, output, files):
+        lines, skipped = write(job)
     for line in lines:
         log.info("%s", line)
     for name, frame, reason in skipped:
@@ -78,69 +84,94 @@ def run(config: ExportConfig) -> int:
     return 1 if skipped else 0
 
 
-_Written = tuple[dict[str, Any], list[str], tuple[tuple[str, int, str], ...]]
-"""Facts for the record, lines to print, and frames whose shape could not be computed."""
+@dataclass(frozen=True)
+class _Job:
+    """One export, with everything read and checked."""
+
+    config: ExportConfig
+    avatar: Avatar
+    path: Path
+    """File of the avatar."""
+    clips: list[Clip]
+    options: CharacterOptions
+    output: Path
+    files: list[Path]
+    """Files of the clips, where the format has them."""
+    blender: list[str]
+    """Command, for formats that Blender writes."""
+    start: float
+    """Time at the start, seconds."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints in the files."""
+        return named_joints(self.avatar.skeleton.names, self.avatar.skeleton.parents, self.config.names)
+
+    @property
+    def subject(self) -> str:
+        """Name of the subject in the files."""
+        return subject_name(self.config, self.avatar)
+
+    def record(self, place: Path, facts: dict[str, Any]) -> None:
+        """Write the record of the export, which completes it."""
+        seconds = round(time.perf_counter() - self.start, 2)
+        write_record(self.config, place, {"avatar": str(self.path), **facts, "seconds": seconds, **machine_facts()})
 
 
-def _write_character(
-    config: ExportConfig, avatar: Avatar, clips: list[Clip], options: CharacterOptions, output: Path, blender: list[str]
-) -> _Written:
+_Written = tuple[list[str], tuple[tuple[str, int, str], ...]]
+"""Lines to print, and frames whose shape could not be computed."""
+
+
+def _write_character(job: _Job) -> _Written:
     """Write the file; fbx and usd are converted by Blender from a temporary .glb."""
-    subject = subject_name(config, avatar)
-    names = named_joints(avatar.skeleton.names, avatar.skeleton.parents, config.names)
 
     def export(path: Path) -> ExportReport:
-        return export_character(avatar, path, clips, options, name=subject, joint_names=names, overwrite=config.overwrite)
+        return export_character(
+            job.avatar, path, job.clips, job.options, name=job.subject, joint_names=job.joint_names, overwrite=True
+        )
 
-    if not blender:
-        report = export(output)
+    if not job.blender:
+        report = export(job.output)
         size = report.num_bytes
     else:
-        rates = {clip.motion.frame_rate for clip in clips}
-        if len(rates) > 1:
-            log.warning(
-                "the motions have different frame rates; %s can have one, and gets %g",
-                config.format,
-                clips[0].motion.frame_rate,
-            )
+        rates = [clip.motion.frame_rate for clip in job.clips]
+        if len(set(rates)) > 1:
+            text = "the motions have different frame rates; %s can have one, and gets %g"
+            log.warning(text, job.config.format, rates[0])
         with TemporaryDirectory() as folder:
-            glb = Path(folder) / f"{subject}.glb"
+            glb = Path(folder) / f"{job.subject}.glb"
             report = export(glb)
-            log.info("converting to %s in Blender", config.format)
-            size = convert(blender, glb, output, clips[0].motion.frame_rate)
-    lines = [*report.lines(), f"{output}: {size / 1e6:.2f} MB"]
-    return {"file": output.name, "bytes": size, **report.facts()}, lines, report.skipped
+            log.info("converting to %s in Blender", job.config.format)
+            size = convert(job.blender, glb, job.output, rates[0])
+    job.record(job.output, {"file": job.output.name, "bytes": size, **report.facts()})
+    return [*report.lines(), f"{job.output}: {size / 1e6:.2f} MB"], report.skipped
 
 
-def _write_vrm(
-    config: ExportConfig, avatar: Avatar, clips: list[Clip], options: CharacterOptions, output: Path, blender: list[str]
-) -> _Written:
+def _write_vrm(job: _Job) -> _Written:
     """Write the model, and each clip as .vrma beside it."""
-    files = clip_files(config, output, [clip.motion.name for clip in clips], "vrma")
     report = export_vrm(
-        avatar,
-        output,
-        clips,
-        options,
-        config.vrm,
-        name=subject_name(config, avatar),
-        joint_names=named_joints(avatar.skeleton.names, avatar.skeleton.parents, config.names),
-        clip_files=files,
-        overwrite=config.overwrite,
+        job.avatar,
+        job.output,
+        job.clips,
+        job.options,
+        job.config.vrm,
+        name=job.subject,
+        joint_names=job.joint_names,
+        clip_files=job.files,
+        overwrite=True,
     )
-    lines = [*report.lines(), f"{output}: {report.num_bytes / 1e6:.2f} MB; clips in {', '.join(file.name for file in files)}"]
-    facts = {"file": output.name, "bytes": report.num_bytes, "clip_files": [file.name for file in files], **report.facts()}
-    return facts, lines, report.skipped
+    names = [file.name for file in job.files]
+    job.record(job.output, {"file": job.output.name, "bytes": report.num_bytes, "clip_files": names, **report.facts()})
+    return [*report.lines(), f"{job.output}: {report.num_bytes / 1e6:.2f} MB; clips in {', '.join(names)}"], report.skipped
 
 
-def _write_meshes(
-    config: ExportConfig, avatar: Avatar, clips: list[Clip], options: CharacterOptions, output: Path, blender: list[str]
-) -> _Written:
+def _write_meshes(job: _Job) -> _Written:
     """Write one mesh per frame."""
-    surface = character_surface(avatar, options)
-    with atomic_folder(output) as folder:
-        skipped = write_sequence(folder, surface, clips, config.format, weight_colors=config.weight_colors)
-    frames = sum(clip.motion.num_frames for clip in clips)
+    surface = character_surface(job.avatar, job.options)
+    frames = sum(clip.motion.num_frames for clip in job.clips)
     vertices, triangles = len(surface.mesh.vertices), len(surface.mesh.faces)
-    lines = [f"{frames - len(skipped)} frames of {vertices} vertices and {triangles} triangles each in {output}"]
-    return {"frames": frames, "vertices": vertices, "triangles": triangles, "skipped": skipped}, lines, tuple(skipped)
+    with atomic_folder(job.output) as folder:
+        skipped = write_sequence(folder, surface, job.clips, job.config.format, weight_colors=job.config.weight_colors)
+        job.record(folder, {"frames": frames, "vertices": vertices, "triangles": triangles, "skipped": skipped})
+    lines = [f"{frames - len(skipped)} frames of {vertices} vertices and {triangles} triangles each in {job.output}"]
+    return lines, tuple(skipped)

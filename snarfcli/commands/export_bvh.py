@@ -13,9 +13,10 @@ from snarfcli.commands.export_places import (
     clip_files,
     default_place,
     read_clips,
-    record_file,
     subject_name,
     wanted_motions,
+    write_record,
+    writing,
 )
 from snarfcli.commands.export_settings import ExportConfig
 from snarfcli.commands.selection import load_selected_avatar, select_frames
@@ -24,7 +25,6 @@ from snarfcli.export.bvh import UNITS, BvhOptions, export_bvh
 from snarfcli.export.clips import Clip
 from snarfcli.export.joint_naming import named_joints
 from snarfcli.export.rig_clips import rig_clip, up_axis_of
-from snarfcli.files import write_json
 from snarfcli.motions import builtin_motion, read_motion
 from snarfcli.motions.reader import RIG_SUFFIXES, average_skeleton, read_rig
 from snarfcli.motions.retarget import choose_clip
@@ -60,12 +60,13 @@ def write_motions(config: ExportConfig) -> int:
         (replace(skeleton, names=named_joints(skeleton.names, skeleton.parents, config.names)), clip, options)
         for skeleton, clip, options in parts
     ]
-    reports = [
-        export_bvh(file, clip, skeleton, options, overwrite=config.overwrite)
-        for file, (skeleton, clip, options) in zip(files, parts, strict=True)
-    ]
-    facts = [{**asdict(report), "path": report.path.name} for report in reports]
-    write_json(record_file(config, output), {"config": asdict(config), "files": facts, **machine_facts()})
+    with writing(config, output, files):
+        reports = [
+            export_bvh(file, clip, skeleton, options, overwrite=True)
+            for file, (skeleton, clip, options) in zip(files, parts, strict=True)
+        ]
+        facts = [{**asdict(report), "path": report.path.name} for report in reports]
+        write_record(config, output, {"files": facts, **machine_facts()})
     for report in reports:
         for line in report.lines():
             log.info("%s", line)

@@ -75,6 +75,8 @@ class ExportConfig(MotionSelection, AvatarSelection):
     """Output file, or folder for ply and obj; null for export/<subject>.<format> beside the avatar."""
     overwrite: bool = MISSING
     """Replace existing output."""
+    wait: bool = False
+    """Wait while another command writes the output, instead of stopping with an error."""
     experiment: str | None = None
     """Preset of settings, which other settings override; null for none."""
 

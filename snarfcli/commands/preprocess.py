@@ -45,6 +45,8 @@ class PreprocessConfig:
     """Seed of the random points; the samples do not depend on the number of workers."""
     overwrite: bool = MISSING
     """Delete existing samples and start again."""
+    wait: bool = False
+    """Wait while another command makes samples of the subject, instead of stopping with an error."""
     sequences: list[str] = MISSING
     """Names of the sequences to sample; empty for all."""
     skip_broken: bool = MISSING
@@ -100,6 +102,7 @@ def run(config: PreprocessConfig) -> None:
             frame_steps,
             workers=workers,
             overwrite=config.overwrite,
+            wait=config.wait,
             sequences=config.sequences,
             skip_broken=config.skip_broken,
         )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import signal
 import socket
+import sys
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from omegaconf import MISSING
 
@@ -27,12 +30,15 @@ from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL, layout_of
 from snarfcli.names import unique_names
 from snarfcli.samples.store import SampleStore
+from snarfcli.viewer.access import is_loopback
 from snarfcli.viewer.picture import SURFACE_NAMES, ViewerLook
-from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback, require_viser
+from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, require_viser
 
 __all__ = ["ViewConfig", "run", "start"]
 
 log = logging.getLogger(__name__)
+
+_EXIT_INTERRUPTED = 130
 
 
 @dataclass
@@ -50,7 +56,7 @@ class ViewConfig(AvatarSelection, MotionSelection):
     weight_colors: bool = MISSING
     """Colour vertices by their skinning weights at the start."""
     host: str = MISSING
-    """Address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for all machines in the network."""
+    """Address to listen on: 127.0.0.1 for this machine only, 0.0.0.0 for all machines in the network (with a token)."""
     port: str = MISSING
     """Port to listen on; auto (or 0) for any free port."""
     open: bool = MISSING
@@ -61,17 +67,32 @@ def run(config: ViewConfig) -> int:
     """Serve the page until Ctrl-C.
 
     Returns:
-        0 if the server ends by itself; Ctrl-C raises KeyboardInterrupt, which ends the command with 130.
+        0 if the server ends by itself; Ctrl-C ends the process with exit code 130.
 
     Raises:
         UserError: viser is not installed, the avatar or a motion does not exist, or the port is in use.
     """
-    server = start(config)
     try:
+        server = start(config)
         server.wait()
-    finally:
-        server.stop()
+    except KeyboardInterrupt:
+        _leave()
+    server.stop()
     return 0
+
+
+def _leave() -> NoReturn:
+    """End the process as after Ctrl-C, but at once: the exit of Python waits for threads, or aborts in their native code.
+
+    Nothing is lost, since the viewer writes no files.
+    """
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # pressed twice
+    print("snarf view: interrupted", file=sys.stderr)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(_EXIT_INTERRUPTED)
 
 
 def start(config: ViewConfig) -> ViewServer:
@@ -103,7 +124,7 @@ def start(config: ViewConfig) -> ViewServer:
         facts=_facts(config, avatar, path),
         first_motion=shelf.first,
     )
-    _announce(config, avatar, path, server.port)
+    _announce(config, avatar, path, server)
     return server
 
 
@@ -189,16 +210,17 @@ def _facts(config: ViewConfig, avatar: Avatar, path: Path) -> dict[str, str]:
     return facts
 
 
-def _announce(config: ViewConfig, avatar: Avatar, path: Path, port: int) -> None:
+def _announce(config: ViewConfig, avatar: Avatar, path: Path, server: ViewServer) -> None:
     """Print the address of the page, and open it if the browser runs on this machine's display."""
-    name = f"[{config.host}]" if ":" in config.host else config.host
-    name = "127.0.0.1" if config.host in ("0.0.0.0", "::") else name
-    address = f"http://{name}:{port}"
+    port = server.port
     log.info("avatar: %s, on %s", path, avatar.device)
-    log.info("page: %s (Ctrl-C ends the server)", address)
+    log.info("page: %s (Ctrl-C ends the server)", server.address)
     if not is_loopback(config.host):
-        log.warning("host=%s: all machines in the network can see and change the page", config.host)
+        message = (
+            "host=%s: whoever knows this address, with its token, can see and change the page; elsewhere it begins with %s"
+        )
+        log.warning(message, config.host, f"http://{socket.gethostname()}:{port}")
     if config.open and can_open_browser():
-        webbrowser.open(address)
+        webbrowser.open(server.address)
     elif is_loopback(config.host) and (os.environ.get("SSH_CONNECTION") or not can_open_browser()):
         log.info("from another machine: ssh -L %d:127.0.0.1:%d %s, then open the page there", port, port, socket.gethostname())

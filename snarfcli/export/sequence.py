@@ -15,6 +15,7 @@ import torch
 
 from snarfcli.errors import UserError
 from snarfcli.export.clips import Clip
+from snarfcli.files import flush_to_disk
 from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh_files import MESH_WRITERS
@@ -22,10 +23,11 @@ from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.names import folder_names
 from snarfcli.progress import progress
 
-__all__ = ["atomic_folder", "check_folder", "write_sequence"]
+__all__ = ["atomic_folder", "check_folder", "tidy_folder", "write_sequence"]
 
 log = logging.getLogger(__name__)
 
+_TEMPORARY = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>tmp|old)")
 _OURS = re.compile(r"frame_\d{6}\.(ply|obj)|export\.json")
 
 
@@ -60,6 +62,21 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
     return place
 
 
+def tidy_folder(folder: Path) -> None:
+    """Bring back the old content of a folder, and delete the new one, after `atomic_folder` was killed.
+
+    Only the holder of the folder's lock may do so.
+    """
+    for path in sorted(folder.parent.iterdir()) if folder.parent.is_dir() else ():
+        match = _TEMPORARY.fullmatch(path.name)
+        if match is None or match["name"] != folder.name or not path.is_dir():
+            continue
+        if match["kind"] == "old" and not folder.exists():
+            path.rename(folder)
+        else:
+            shutil.rmtree(path, ignore_errors=True)
+
+
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder that replaces `folder` when the block succeeds, and is deleted when it fails.
@@ -83,6 +100,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
         if folder.exists():
             folder.rename(aside)
         temporary.rename(folder)
+        flush_to_disk(folder.parent)
     except OSError as error:
         if aside.exists() and not folder.exists():
             aside.rename(folder)

@@ -30,7 +30,7 @@ def load_checkpoint(path: str | Path, file_format: str, version: int, what: str)
     if not path.exists():
         raise UserError(f'no {what} at {path}; train one with "snarf train" or name another file')
     content = read_plain_torch(path, what)
-    if not isinstance(content, dict) or content.get("format") != file_format:
+    if not isinstance(content, dict) or type(content.get("format")) is not str or content["format"] != file_format:
         raise UserError(f'{path} is not a snarf {what}; give the file that "snarf train" wrote')
     came = content.get("version")
     if type(came) is not int or came != version:

@@ -12,7 +12,7 @@ import torch
 
 from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.extract import EmptySurface, FullSurface
-from snarfcli.meshing.mesh import Mesh
+from snarfcli.meshing.mesh import Mesh, keep_components
 from snarfcli.meshing.mesh_files import read_mesh, write_mesh
 from snarfcli.meshing.posed import posed_mesh
 from snarfcli.meshing.skinned import skinned_surface
@@ -50,12 +50,12 @@ class FrameRecord:
     extraction_s: float = 0.0
     rendering_s: float = 0.0
     vertices: int = 0
-    points: int = 0
-    """Points at which the field was evaluated; 0 for an existing mesh."""
-    components: int = 0
-    """Connected surfaces; 0 for an existing mesh."""
-    is_capped: bool = False
-    """Whether the surface reached the border of its box and was closed there."""
+    points: int | None = 0
+    """Points at which the field was evaluated; None for an existing mesh."""
+    components: int | None = 0
+    """Connected surfaces; None for an existing mesh that was not read."""
+    is_capped: bool | None = False
+    """Whether the surface reached the border of its box and was closed there; None for an existing mesh."""
     was_there: bool = False
     """Whether the mesh file existed already and was kept."""
     problem: str | None = None
@@ -118,8 +118,11 @@ class Animation:
         mesh = None
         if file and file.exists():
             frame.was_there = True
+            frame.points = frame.components = frame.is_capped = None
             mesh = read_mesh(file) if self.screen else None
-            frame.vertices = len(mesh.vertices) if mesh else 0
+            if mesh is not None:
+                frame.vertices = len(mesh.vertices)
+                frame.components = keep_components(mesh.vertices, mesh.faces, 0.0)[3] if self.surface == "field" else 0
         else:
             mesh = self._extract(index, frame)
             if file and mesh is not None:

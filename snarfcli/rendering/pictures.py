@@ -14,8 +14,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from snarfcli.interrupts import interrupts_held_back
 from snarfcli.meshing.mesh import Mesh
-from snarfcli.parallel import Worker, choose_processes, end_workers, interrupts_held_back
+from snarfcli.parallel import Worker, choose_processes, end_workers
 from snarfcli.progress import progress
 from snarfcli.rendering.animation import Animation, FrameRecord
 from snarfcli.rendering.panels import Screen

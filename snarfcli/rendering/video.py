@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from snarfcli.errors import UserError
 from snarfcli.files import atomic_path
+from snarfcli.texts import one_line
 
 __all__ = ["write_video"]
 
@@ -29,7 +31,8 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], frame_rate: floa
 
     Raises:
         ValueError: there are no pictures, their sizes differ, or the frame rate is not positive.
-        OSError: the file cannot be written, or the encoder failed.
+        UserError: the encoder failed, for example because the disk is full.
+        OSError: the file cannot be written.
     """
     import imageio_ffmpeg
 
@@ -61,13 +64,39 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], frame_rate: floa
                 if frame.shape[:2] != (height, width):
                     raise ValueError(f"frames: wanted all of size {[height, width, 3]}, got {list(frame.shape)}")
                 even = np.pad(frame, np.array([(0, height % 2), (0, width % 2), (0, 0)]), mode="edge")
-                writer.send(np.ascontiguousarray(even))
+                try:
+                    writer.send(np.ascontiguousarray(even))
+                except OSError as error:  # the encoder has ended; the message has all its output
+                    raise _not_encoded(path, str(error).strip().splitlines()[-1]) from None
                 count += 1
         finally:
             if writer is not None:
                 writer.close()
         if count == 0:
             raise ValueError(f"frames: wanted at least one picture for {path}, got none")
-        if not temporary.is_file() or temporary.stat().st_size == 0:
-            raise OSError(f"{path}: wanted a video, got an empty file from the encoder")
+        if not _is_whole(temporary):  # the encoder does not tell that the disk was full
+            raise _not_encoded(path, "the file is not complete")
     return count
+
+
+def _not_encoded(path: Path | str, reason: str) -> UserError:
+    why = one_line(reason, 200)
+    return UserError(f"video {path} could not be encoded ({why}); check the free space on the disk, then run the command again")
+
+
+def _is_whole(path: Path) -> bool:
+    """Return whether an MP4 file has all its parts: whole boxes, with the index in front of the pictures."""
+    if not path.is_file():
+        return False
+    size, place, boxes = path.stat().st_size, 0, []
+    with path.open("rb") as file:
+        while place + 8 <= size:
+            file.seek(place)
+            head = file.read(16)
+            length = int.from_bytes(head[:4], "big")
+            length = int.from_bytes(head[8:], "big") if length == 1 else length  # 64 bits, for more than 4 GiB
+            if length < 8:
+                return False
+            boxes.append(head[4:8])
+            place += length
+    return place == size and b"mdat" in boxes and b"moov" in boxes[: boxes.index(b"mdat")]

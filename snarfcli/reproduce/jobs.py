@@ -16,7 +16,7 @@ from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json, write_json
-from snarfcli.locks import locked
+from snarfcli.locks import inherited_locks, locked
 from snarfcli.reproduce.plans import EvaluationStage, Job
 from snarfcli.samples.layout import samples_folder
 from snarfcli.texts import one_line
@@ -153,12 +153,9 @@ class _Stages:
         if self.before.state == "diverged" and self.before.digest == self.job.digest and self._has_diverged():
             return replace(self.before, seconds={})
         for samples in self.job.samples:
-            if not _samples_exist(samples.folder):
-                place = Path(samples.folder)
-                with locked(place.with_name(f".{place.name}.lock"), self._check):
-                    if not _samples_exist(samples.folder) and not self._stage("samples", samples.arguments):
-                        return self.status
-        if not self.status.trained:
+            if not _samples_exist(samples.folder) and not self._stage("samples", samples.arguments):
+                return self.status
+        if not (self.status.trained and (self.folder / "metrics.json").is_file()):
             if not self._stage("train", self.job.train):
                 return self.status
             self._write(trained=True)
@@ -210,6 +207,9 @@ class _Stages:
 def run_command(arguments: Sequence[str], log: Path, stopped: Callable[[], bool]) -> int:
     """Run `snarf` in a new process and return its exit code; see `Runner`.
 
+    The command waits while another one writes to its output folder, such as one that a killed `snarf reproduce` has left. It
+    inherits the locks of this process, so that the run stays locked until the command has ended, however this process ends.
+
     Raises:
         JobStopped: it was interrupted because `stopped` returned True.
     """
@@ -218,27 +218,39 @@ def run_command(arguments: Sequence[str], log: Path, stopped: Callable[[], bool]
         file.write(f"$ snarf {' '.join(arguments)}\n")
         file.flush()
         process = subprocess.Popen(
-            [sys.executable, "-m", "snarfcli", *arguments], stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT
-        )
-        asked_s: float | None = None
-        while True:
-            try:
-                code = process.wait(_LOOK_EVERY_S)
-                break
-            except subprocess.TimeoutExpired:
-                if asked_s is None and stopped():
-                    # as Ctrl-C, after which a training writes its checkpoint
-                    process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
-                    asked_s = time.monotonic()
-                elif asked_s is not None and time.monotonic() - asked_s > _PATIENCE_S:
-                    process.kill()
-            except BaseException:
-                process.kill()
-                process.wait()
-                raise
-    if asked_s is not None and code != 0:
+            [sys.executable, "-m", "snarfcli", *arguments, "wait=true"],
+            stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, pass_fds=inherited_locks(),
+        )  # fmt: skip
+        try:
+            code, was_asked = _wait(process, stopped)
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+    if was_asked and code != 0:
         raise JobStopped
     return code
+
+
+def _wait(process: subprocess.Popen[bytes], stopped: Callable[[], bool]) -> tuple[int, bool]:
+    """Wait for a command; return its exit code, and whether it was asked to end.
+
+    It is asked when `stopped` returns True, or this process is asked to end. A second request raises.
+    """
+    asked_s: float | None = None
+    while True:
+        try:
+            return process.wait(_LOOK_EVERY_S), asked_s is not None
+        except (subprocess.TimeoutExpired, KeyboardInterrupt) as reason:
+            is_request = isinstance(reason, KeyboardInterrupt)
+            if is_request and asked_s is not None:
+                raise
+            if asked_s is None and (is_request or stopped()):
+                # as Ctrl-C, after which a training writes its checkpoint
+                process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
+                asked_s = time.monotonic()
+            elif asked_s is not None and time.monotonic() - asked_s > _PATIENCE_S:
+                process.kill()
 
 
 def _samples_exist(folder: str) -> bool:

@@ -13,12 +13,12 @@ import importlib.util
 import logging
 import os
 import secrets
+import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,8 @@ from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.hydra_config.overrides import quote
-from snarfcli.locks import one_of
+from snarfcli.interrupts import signals_as_interrupts
+from snarfcli.locks import hold_output, holder_is_gone, inherited_locks, lock_file, one_of, try_lock
 from snarfcli.reproduce.jobs import JobStatus, read_job_status, run_job
 from snarfcli.reproduce.plans import Job
 from snarfcli.texts import one_line
@@ -96,7 +97,8 @@ def launch(
 ) -> list[JobStatus | None]:
     """Run jobs and return the status of each; None for a job that the launcher has not started.
 
-    On Ctrl-C (or SIGTERM, SIGHUP) every running command writes its checkpoint; a second Ctrl-C kills all processes.
+    On Ctrl-C (or SIGTERM, SIGHUP) every running command writes its checkpoint; a second Ctrl-C kills all processes. If this
+    process is killed, the jobs notice it and end likewise.
 
     Args:
         jobs: the jobs.
@@ -109,13 +111,23 @@ def launch(
         KeyboardInterrupt: interrupted; all processes have ended.
     """
     work = folder / secrets.token_hex(4)
-    work.mkdir(parents=True)
+    with hold_output(work, "snarf reproduce"):
+        _remove_abandoned(folder)
+        work.mkdir(parents=True)
+        return _launch(jobs, work, launcher, on_change)
+
+
+def _launch(
+    jobs: Sequence[Job], work: Path, launcher: Launcher, on_change: Callable[[int, JobStatus], None]
+) -> list[JobStatus | None]:
+    """Run jobs with their files in the folder `work`, which is deleted when all have ended as planned; see `launch`."""
     write_json(work / "plan.json", {"slots": _slots(launcher), "jobs": [asdict(job) for job in jobs]})
     said = work / "launcher.log"
     with said.open("w") as file:
         process = subprocess.Popen(
             [sys.executable, "-m", "snarfcli", *_arguments(work, len(jobs), launcher)],
             stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
+            pass_fds=inherited_locks(),
         )  # fmt: skip
     seen: dict[int, JobStatus] = {}
 
@@ -127,7 +139,7 @@ def launch(
                     seen[number] = status
                     on_change(number, status)
 
-    with _signals_as_interrupt():
+    with signals_as_interrupts():
         try:
             while process.poll() is None:
                 look()
@@ -144,7 +156,22 @@ def launch(
         if not seen:
             raise UserError(f"launcher={launcher.name} started no job: {why}")
         log.warning("warning: launcher=%s ended before %d of %d jobs did: %s", launcher.name, len(left), len(jobs), why)
+    if not left:
+        shutil.rmtree(work, ignore_errors=True)
     return [seen.get(number) for number in range(len(jobs))]
+
+
+def _remove_abandoned(folder: Path) -> None:
+    """Delete the folders of earlier calls that no process uses any more."""
+    names = {path.name if path.is_dir() else path.name.split(".")[1] for path in folder.iterdir()}
+    for work in sorted(folder / name for name in names):
+        release = try_lock(lock_file(work))
+        if release is None:
+            continue
+        shutil.rmtree(work, ignore_errors=True)
+        release()
+        for path in folder.glob(f".{work.name}.*"):  # its lock, and who held it
+            path.unlink(missing_ok=True)
 
 
 def run_planned_job(plan: Path, number: int) -> None:
@@ -156,10 +183,13 @@ def run_planned_job(plan: Path, number: int) -> None:
     job, slots = read_planned_job(plan, number)
     result, stop = plan.with_name(f"{number}.json"), plan.with_name("stop")
 
+    def stopped() -> bool:
+        return stop.exists() or holder_is_gone(plan.parent)
+
     def begin() -> JobStatus:
-        if not stop.exists():
+        if not stopped():
             write_json(result, asdict(JobStatus("running", job.digest)))
-        return run_job(job, stopped=stop.exists)
+        return run_job(job, stopped=stopped)
 
     try:
         if slots is None:
@@ -228,26 +258,3 @@ def _stop(process: subprocess.Popen[Any], work: Path) -> None:
         else:
             process.kill()
         process.wait()
-
-
-@contextlib.contextmanager
-def _signals_as_interrupt() -> Iterator[None]:
-    """Handle SIGTERM and SIGHUP like Ctrl-C, unless they are ignored in this process, as with nohup."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def handle(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    names = [name for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    numbers = [getattr(signal, name) for name in names]
-    before = {number: signal.getsignal(number) for number in numbers}
-    for number in numbers:
-        if before[number] is not signal.SIG_IGN:
-            signal.signal(number, handle)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

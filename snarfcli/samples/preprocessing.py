@@ -14,6 +14,7 @@ import numpy as np
 from snarfcli.datasets.splits import SPLITS
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.errors import UserError, nearest
+from snarfcli.locks import hold_output
 from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
 from snarfcli.samples.finished import complete_sequences, write_subject
@@ -22,7 +23,6 @@ from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.writing import (
     SequenceWriter,
     discard_samples,
-    hold_folder,
     remove_leftovers,
     require_same_settings,
     write_manifest,
@@ -57,6 +57,7 @@ def preprocess_subject(
     *,
     workers: int = 1,
     overwrite: bool = False,
+    wait: bool = False,
     sequences: Sequence[str] = (),
     skip_broken: bool = False,
 ) -> dict[str, Any]:
@@ -69,6 +70,7 @@ def preprocess_subject(
         frame_steps: per split, the step between sampled frames of a motion.
         workers: number of processes.
         overwrite: delete existing samples first.
+        wait: wait while another process makes samples of the subject, instead of raising.
         sequences: names of the sequences to make; all if empty.
         skip_broken: leave out sequences that cannot be used, with a warning, instead of raising.
 
@@ -88,7 +90,7 @@ def preprocess_subject(
         **{f"{split}_frame_step": step for split, step in frame_steps.items()},
     }
     folder = samples_folder(root, subject.data, subject.subject)
-    with hold_folder(folder):
+    with hold_output(folder, "snarf preprocess", wait=wait):
         try:
             remove_leftovers(folder)
             new = [spec for spec in chosen if overwrite or not (folder / spec.split / spec.name / "sequence.json").exists()]

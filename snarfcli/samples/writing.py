@@ -8,7 +8,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,8 +16,7 @@ import numpy as np
 
 from snarfcli.datasets.splits import SPLITS
 from snarfcli.errors import UserError
-from snarfcli.files import file_digest, read_json, write_arrays, write_json
-from snarfcli.locks import try_lock
+from snarfcli.files import file_digest, flush_to_disk, read_json, remove_temporaries, write_arrays, write_json
 from snarfcli.samples.layout import FORMAT_VERSION, SEQUENCE_FILES, check_format
 from snarfcli.sampling.points import FrameSamples
 from snarfcli.texts import one_line
@@ -26,7 +25,6 @@ __all__ = [
     "SequenceWriter",
     "describe_files",
     "discard_samples",
-    "hold_folder",
     "remove_leftovers",
     "require_same_settings",
     "settings_digest",
@@ -155,10 +153,13 @@ class SequenceWriter:
             "boundary_edges": self._boundary_edges,
             "files": describe_files(self._partial, SEQUENCE_FILES),
         }
+        for name in SEQUENCE_FILES:
+            flush_to_disk(self._partial / name)
         write_json(self._partial / "sequence.json", complete)
         if self.folder.exists():
             shutil.rmtree(self.folder)
         os.replace(self._partial, self.folder)
+        flush_to_disk(self.folder.parent)
         return complete
 
     def _write_spooled(self, name: str, places: np.ndarray, row: tuple[int, ...], dtype: str) -> np.ndarray:
@@ -216,6 +217,7 @@ def discard_samples(folder: Path) -> None:
 
 def remove_leftovers(folder: Path) -> None:
     """Delete incomplete files of an interrupted run: partial sequences, a subject without sequences, empty folders."""
+    remove_temporaries(folder)
     for partial in folder.glob(f"*/.*{_PARTIAL}"):
         shutil.rmtree(partial, ignore_errors=True)
     if not any(folder.glob("*/*/sequence.json")):
@@ -224,24 +226,6 @@ def remove_leftovers(folder: Path) -> None:
     for empty in (*(folder / split for split in SPLITS), folder):
         with contextlib.suppress(OSError):
             empty.rmdir()
-
-
-@contextlib.contextmanager
-def hold_folder(folder: Path) -> Iterator[None]:
-    """Create `folder` and lock it while the block runs; the lock is a hidden file beside it.
-
-    Raises:
-        UserError: another process holds the lock.
-        OSError: the folder cannot be created.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    release = try_lock(folder.with_name(f".{folder.name}.preprocess.lock"))
-    if release is None:
-        raise UserError(f"another snarf preprocess is working in {folder}; wait for it, or end it")
-    try:
-        yield
-    finally:
-        release()
 
 
 def write_manifest(folder: Path, header: Mapping[str, Any], sequences: list[dict[str, Any]]) -> dict[str, Any]:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import logging
-import signal
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from snarfcli.files import write_tensors
+from snarfcli.interrupts import interrupts_noted
+from snarfcli.progress import progress_bar
 from snarfcli.training.trainer import Trainer
 
 __all__ = ["train"]
@@ -27,7 +24,8 @@ _LAST_STEPS = 50  # reported losses are means over this number of steps
 def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str, float]], None]) -> dict[str, Any]:
     """Run all remaining steps, with checkpoints in `folder`.
 
-    Ctrl-C finishes the running step, writes a checkpoint and raises KeyboardInterrupt; a second one stops at once.
+    Ctrl-C, SIGTERM and SIGHUP finish the running step, write a checkpoint and raise KeyboardInterrupt; a second Ctrl-C stops
+    at once.
 
     Args:
         trainer: new or restored.
@@ -35,41 +33,48 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
         on_scalars: called with the step and named numbers, for TensorBoard.
 
     Returns:
-        The last validation and the speed of this part of the run.
+        The last validation, the speed of this part of the run, and the time per step of all parts.
     """
     config = trainer.config
-    first_step, start, reported = trainer.step, time.monotonic(), 0.0
+    first_step, seconds_before = trainer.step, trainer.seconds
+    start, reported = time.monotonic(), 0.0
     recent: list[dict[str, float]] = []
     validation: dict[str, float] = {}
     points_per_step = config.poses_per_step * (config.uniform_points + config.surface_points)
     paused = 0.0
 
-    with closing(trainer.batches), _interrupt_between_steps() as interrupted, _bar(config.steps, first_step) as bar:
+    bar = progress_bar(total=config.steps, done=first_step, desc="train", unit="step")
+    with closing(trainer.batches), interrupts_noted(_tell_of_interrupt) as interrupt, bar as shown:
         while trainer.step < config.steps:
             recent = [*recent, trainer.advance()][-_LAST_STEPS:]
             step, last = trainer.step, trainer.step == config.steps
             seconds = time.monotonic() - start - paused
+            trainer.seconds = seconds_before + seconds
             speed = (step - first_step) / max(seconds, 1e-9)
             if step % 20 == 0 or last:
                 on_scalars(step, recent[-1] | {"learning_rate": trainer.learning_rate()})
                 on_scalars(step, {"points_per_second": speed * points_per_step})
-            if step % config.validate_every == 0 or last:
+            validates = step % config.validate_every == 0 or last
+            if interrupt or validates or step % config.checkpoint_every == 0:
+                write_tensors(folder / "checkpoint.pt", trainer.state())
+            if interrupt:
+                raise interrupt.as_error()
+            if validates:
                 before = time.monotonic()
-                validation = trainer.validate()
+                with interrupt.at_once():
+                    validation = trainer.validate()
                 on_scalars(step, {f"validation_{name}": value for name, value in validation.items()})
                 paused += time.monotonic() - before
-            if interrupted.is_set() or step % config.checkpoint_every == 0 or last:
-                write_tensors(folder / "checkpoint.pt", trainer.state())
-            if interrupted.is_set():
-                raise KeyboardInterrupt
             line = _line(recent, validation, speed * points_per_step)
-            if bar is not None:
-                bar.update(1)
-                bar.set_postfix_str(line, refresh=False)
+            if shown is not None:
+                shown.update(1)
+                shown.set_postfix_str(line, refresh=False)
             elif seconds + paused - reported >= _REPORT_EVERY_S or last:
                 reported = seconds + paused
                 remaining = (config.steps - step) / speed
                 log.info("step %d of %d, %s, %.0f s left", step, config.steps, line, remaining)
+        if interrupt:  # after the last step: the checkpoint has it
+            raise interrupt.as_error()
     seconds = time.monotonic() - start - paused
     steps = trainer.step - first_step
     validation = validation or trainer.validate()  # a run interrupted after its last step has none yet
@@ -78,7 +83,7 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
         "steps_this_run": steps,
         "seconds_this_run": round(seconds, 2),
         "validation_seconds": round(paused, 2),
-        "seconds_per_step": round(seconds / steps, 4) if steps else None,
+        "seconds_per_step": round(trainer.seconds / trainer.step, 4) if trainer.step else None,
         "points_per_second": round(points_per_step * steps / seconds) if steps else None,
         "inside_without_correspondence": _mean(recent, "inside_without_correspondence"),
     }
@@ -102,32 +107,5 @@ def _mean(recent: list[dict[str, float]], name: str) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
-@contextmanager
-def _bar(steps: int, first_step: int) -> Iterator[Any]:
-    """Yield a progress bar on a terminal, else None."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    with tqdm(total=steps, initial=first_step, desc="train", unit="step", dynamic_ncols=True) as bar:
-        yield bar
-
-
-@contextmanager
-def _interrupt_between_steps() -> Iterator[threading.Event]:
-    """Yield an event that the first Ctrl-C sets, so that the running step is finished; the second raises KeyboardInterrupt."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-
-    def handle(number: int, frame: Any) -> None:
-        if event.is_set():
-            raise KeyboardInterrupt
-        event.set()
-        log.info("interrupted: finishing the step and writing a checkpoint; press Ctrl-C again to stop at once")
-
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, before)
+def _tell_of_interrupt() -> None:
+    log.info("interrupted: finishing the step and writing a checkpoint; press Ctrl-C again to stop at once")

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from snarfcli.parallel import Worker, interrupts_held_back
+from snarfcli.interrupts import interrupts_held_back
+from snarfcli.parallel import Worker
 
 __all__ = ["Prefetch"]
 

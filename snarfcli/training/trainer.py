@@ -89,6 +89,8 @@ class Trainer:
         self.made_up = MadeUpPoses(self.batches.poses())
         self.optimizer = AveragedAdam(self.model, config)
         self.step = 0
+        self.seconds = 0.0
+        """Time that the steps have taken, in all parts of the run."""
 
     def advance(self) -> dict[str, float]:
         """Take one step and return its losses and counts.
@@ -282,6 +284,7 @@ class Trainer:
             "format": CHECKPOINT_FORMAT,
             "version": CHECKPOINT_VERSION,
             "step": self.step,
+            "seconds": self.seconds,
             "seed": self.seed,
             "avatar": self.avatar.to_dict(),
             "training": asdict(self.config),
@@ -315,6 +318,7 @@ class Trainer:
                 self.refiner.restore(state["poses"])
             torch.set_rng_state(read_tensor(state["random"], "random", torch.get_rng_state().shape, torch.uint8))
             self.step = self._checked_step(state["step"])
+            self.seconds = self._checked_seconds(state.get("seconds", 0.0))
         except (LookupError, RuntimeError, TypeError, ValueError, AttributeError) as error:
             if is_out_of_memory(error):
                 raise
@@ -331,6 +335,12 @@ class Trainer:
         if type(step) is not int or not 0 <= step <= self.config.steps:
             raise ValueError(f"step: wanted 0 to {self.config.steps}, got another")
         return step
+
+    def _checked_seconds(self, seconds: Any) -> float:
+        """Return the time in a checkpoint; ValueError if it is none."""
+        if type(seconds) not in (int, float) or not 0 <= seconds < math.inf:
+            raise ValueError("seconds: wanted a number from 0, got another")
+        return float(seconds)
 
 
 def _differences(theirs: Any, ours: Any, prefix: str = "") -> list[str]:

@@ -6,6 +6,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from snarfcli.texts import markdown_text
+from snarfcli.viewer.gate import Gate
+from snarfcli.viewer.inputs import Inputs
 from snarfcli.viewer.look_tab import LookTab
 from snarfcli.viewer.motion_tab import MotionTab
 from snarfcli.viewer.picture import Picture
@@ -16,6 +19,7 @@ from snarfcli.viewer.state import ViewerState
 __all__ = ["Controls"]
 
 _TEXT_EVERY_S = 0.25
+_TITLE, _LONGEST_FACT = ("subject", "data", "model"), 60
 _MEASURED, _MEASURED_S = 31, 6.0  # frames and seconds over which the frame rate is measured
 
 
@@ -24,6 +28,7 @@ class Controls:
 
     Args:
         server: server of viser.
+        gate: told what the inputs offer.
         state: state of the viewer.
         scene: scene of the viewer.
         motions: names of the motions that can be played.
@@ -36,6 +41,7 @@ class Controls:
     def __init__(
         self,
         server: Any,
+        gate: Gate,
         state: ViewerState,
         scene: ViewerScene,
         motions: Sequence[str],
@@ -44,7 +50,7 @@ class Controls:
         first_motion: str | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        gui = server.gui
+        gui, inputs = server.gui, Inputs(server.gui, gate)
         self._facts = facts
         self._clock = clock
         self._next_text = 0.0
@@ -55,13 +61,13 @@ class Controls:
         self._text = gui.add_markdown("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Motion"):
-            self.motion = MotionTab(gui, state, motions, load_motion, first_motion)
+            self.motion = MotionTab(inputs, state, motions, load_motion, first_motion)
         with tabs.add_tab("Pose"):
-            self.pose = PoseTab(gui, state, scene)
+            self.pose = PoseTab(inputs, state, scene)
         with tabs.add_tab("Look"):
-            LookTab(gui, state, scene)
+            LookTab(inputs, state, scene)
         with tabs.add_tab("About"):
-            rows = "\n".join(f"| {name} | {value} |" for name, value in facts.items())
+            rows = "\n".join(f"| {markdown_text(name)} | {markdown_text(value)} |" for name, value in facts.items())
             gui.add_markdown(f"| | |\n|---|---|\n{rows}")
 
     def follow(self, picture: Picture) -> float | None:
@@ -82,11 +88,11 @@ class Controls:
         return _TEXT_EVERY_S if self._changes else None
 
     def _status(self, picture: Picture, now: float) -> str:
-        """Return the status as Markdown: surface, frame rate and errors."""
+        """Return the status as Markdown: surface, frame rate and errors; texts of files are escaped."""
         self._changes = [changed for changed in self._changes[-_MEASURED:] if changed > now - _MEASURED_S]
         spans = len(self._changes) - 1
         rate = spans / max(self._changes[-1] - self._changes[0], 1e-3) if spans > 0 else 0.0
-        title = " · ".join(value for name, value in self._facts.items() if name in ("subject", "data", "model"))
+        title = " · ".join(markdown_text(self._facts[name], _LONGEST_FACT) for name in _TITLE if name in self._facts)
         mesh = picture.mesh
         parts = ["no surface yet"] if mesh is None else [mesh.surface, f"{len(mesh.vertices):,} vertices"]
         times = []
@@ -98,5 +104,5 @@ class Controls:
             times.append(f"{'surface' if mesh.surface == 'field' else 'shape'} in {mesh.seconds:.2f} s")
         # a constant number of lines, so that the panel below does not jump
         lines = [f"**{title}**", " · ".join(parts), " · ".join(times) or "&nbsp;"]
-        lines += [f"⚠ {text}" for text in (self.motion.notice, picture.message) if text]
+        lines += [f"⚠ {markdown_text(text)}" for text in (self.motion.notice, picture.message) if text]
         return "  \n".join(lines)

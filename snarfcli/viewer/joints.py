@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from snarfcli.bodies import Skeleton
 from snarfcli.bodies.skinning import transform_points
 from snarfcli.motions.joint_names import find_body_parts
+from snarfcli.names import unique_names
+from snarfcli.texts import one_line
 
 __all__ = [
     "ANGLE_LIMITS_DEG",
@@ -38,6 +40,7 @@ _LIMBS = (
     ("hand", ("index", "middle", "pinky", "ring", "thumb")),
     ("leg", ("hip", "knee", "ankle", "foot")),
 )
+_LONGEST = 60  # characters of a name in a label
 _HEAD = ("neck", "head", "jaw", "l_eye", "r_eye")
 
 
@@ -56,19 +59,16 @@ def vector_of(angles: tuple[float, float, float] | NDArray[np.float64]) -> NDArr
 
 def joint_labels(skeleton: Skeleton) -> dict[str, int]:
     """Return a label for each joint except the root, ordered by limbs: `left arm: elbow`, `trunk: spine2`, `Tail_03`."""
-    parts = find_body_parts(skeleton.names, skeleton.parents)
-    parts_of = {joint: part for part, joint in parts.joints.items()}
-    limbs: dict[str, list[int]] = {}
-    for joint in range(1, skeleton.num_joints):
-        limbs.setdefault(_limb_of(joint, parts_of.get(joint), parts.spine), []).append(joint)
-    order = ["trunk", "head", *(f"{side} {limb}" for limb in ("arm", "hand", "leg") for side in _SIDES.values())]
-    labels: dict[str, int] = {}
-    for limb in sorted(limbs, key=lambda name: order.index(name) if name in order else len(order)):
-        for joint in limbs[limb]:
-            name = skeleton.names[joint]
-            label = f"{limb}: {_without_side(name)}" if limb else name
-            labels[label if label not in labels else f"{label} ({joint})"] = joint
-    return labels
+    body = find_body_parts(skeleton.names, skeleton.parents)
+    part_of = {joint: part for part, joint in body.joints.items()}
+    order = ["trunk", "head", *(f"{side} {limb}" for limb in ("arm", "hand", "leg") for side in _SIDES.values()), ""]
+    limbs = {joint: _limb_of(joint, part_of.get(joint), body.spine) for joint in range(1, skeleton.num_joints)}
+    joints = sorted(limbs, key=lambda joint: order.index(limbs[joint]))
+    labels = []
+    for joint in joints:
+        name = one_line(skeleton.names[joint], _LONGEST) or f"joint {joint}"  # names come from a file
+        labels.append(f"{limbs[joint]}: {_without_side(name)}" if limbs[joint] else name)
+    return dict(zip(unique_names(labels), joints, strict=True))
 
 
 def _limb_of(joint: int, part: str | None, spine: tuple[int, ...]) -> str:

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from snarfcli.errors import UserError
+from snarfcli.names import unique_names
 from snarfcli.texts import one_line
-from snarfcli.viewer.inputs import on_user
+from snarfcli.viewer.inputs import Inputs
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.state import ViewerState
 
@@ -15,13 +16,14 @@ __all__ = ["NO_MOTION", "MotionTab"]
 
 NO_MOTION = "none"
 _SPEEDS = (0.1, 2.0)
+_LONGEST = 80  # characters of a name in the list
 
 
 class MotionTab:
     """The inputs of the motion, added to the current container of viser.
 
     Args:
-        gui: GUI of viser.
+        inputs: makes the inputs.
         state: state of the viewer.
         motions: names of the motions that can be played.
         load_motion: returns the motion of a name and its bone transforms; raises UserError.
@@ -30,7 +32,7 @@ class MotionTab:
 
     def __init__(
         self,
-        gui: Any,
+        inputs: Inputs,
         state: ViewerState,
         motions: Sequence[str],
         load_motion: Callable[[str], tuple[Any, Any]],
@@ -38,30 +40,32 @@ class MotionTab:
     ) -> None:
         self._state = state
         self._load_motion = load_motion
+        shown = [one_line(name, _LONGEST) or "unnamed" for name in motions]  # names come from files
+        self._names = dict(zip(unique_names([NO_MOTION, *shown])[1:], motions, strict=True))
         self._is_playing: bool | None = None
         self.notice: str | None = None
         """Why the chosen motion cannot be played, in one line; None if it can."""
-        self.names = gui.add_dropdown("Motion", (NO_MOTION, *motions), initial_value=first or NO_MOTION)
-        self._play = gui.add_button("Play", icon="player-play")
-        self._frame = gui.add_slider("Frame", 0, 1, 1, 0)
-        speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="1 is the original speed")
-        loop = gui.add_checkbox("Loop", state.player.is_looping)
-        in_place = gui.add_checkbox(
+        start = next((label for label, name in self._names.items() if name == first), NO_MOTION)
+        self.names = inputs.add_dropdown("Motion", (NO_MOTION, *self._names), start)
+        self._play = inputs.add_button("Play", lambda client: self._play_or_pause(), icon="player-play")
+        self._frame = inputs.add_slider("Frame", 0, 1, 1, 0)
+        speed = inputs.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="1 is the original speed")
+        loop = inputs.add_checkbox("Loop", state.player.is_looping)
+        in_place = inputs.add_checkbox(
             "Stay in place", state.look.is_in_place, hint="the body keeps its height, but does not travel"
         )
-        on_user(self.names, lambda handle, client: self.choose(handle.value))
-        self._play.on_click(lambda event: self._play_or_pause())
-        on_user(self._frame, lambda handle, client: self._seek(handle.value))
-        on_user(speed, lambda handle, client: state.change_speed(handle.value))
-        on_user(loop, lambda handle, client: state.change_looping(handle.value))
-        on_user(in_place, lambda handle, client: state.change_look(is_in_place=handle.value))
+        inputs.on_user(self.names, self.choose)
+        inputs.on_user(self._frame, self._seek)
+        inputs.on_user(speed, state.change_speed)
+        inputs.on_user(loop, state.change_looping)
+        inputs.on_user(in_place, lambda value: state.change_look(is_in_place=value))
         self._fit_frames()
 
     def choose(self, name: str) -> None:
-        """Load and play the motion with this name."""
+        """Load and play the motion with this name in the list."""
         self.notice = None
         try:
-            motion, transforms = (None, None) if name == NO_MOTION else self._load_motion(name)
+            motion, transforms = (None, None) if name == NO_MOTION else self._load_motion(self._names[name])
         except UserError as error:
             self.notice = one_line(error)
             motion, transforms = None, None
@@ -97,4 +101,4 @@ class MotionTab:
     def _seek(self, frame: int) -> None:
         if self._state.motion is not None:
             self._state.pause()
-            self._state.seek(int(frame))
+            self._state.seek(frame)

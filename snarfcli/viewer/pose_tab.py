@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from snarfcli.viewer.inputs import AngleSliders, on_user, rounded
+from snarfcli.viewer.inputs import AngleSliders, Inputs, rounded
 from snarfcli.viewer.joints import joint_labels, pose_file
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.scene import ViewerScene
@@ -22,32 +22,29 @@ class PoseTab:
     """The inputs of the pose, added to the current container of viser.
 
     Args:
-        gui: GUI of viser.
+        inputs: makes the inputs.
         state: state of the viewer.
         scene: scene of the viewer, which marks the chosen joint.
     """
 
-    def __init__(self, gui: Any, state: ViewerState, scene: ViewerScene) -> None:
-        self._gui = gui
+    def __init__(self, inputs: Inputs, state: ViewerState, scene: ViewerScene) -> None:
+        self._inputs = inputs
         self._state = state
         self._scene = scene
         self._labels = joint_labels(state.body.skeleton)
         self._seen_pose = -1  # number of the pose that the sliders show
-        with gui.add_folder("Joint", visible=bool(self._labels)):  # a skeleton of one joint has its root only
+        with inputs.add_folder("Joint", visible=bool(self._labels)):  # a skeleton of one joint has its root only
             joints = tuple(self._labels) or ("none",)
-            self._joint = gui.add_dropdown("Joint", joints, hint="or click one in the picture (Look: skeleton)")
+            self._joint = inputs.add_dropdown("Joint", joints, joints[0], hint="or click one in the picture (Look: skeleton)")
             self._angles = self._add_angles(lambda: self.joint)
-            buttons = gui.add_button_group("", ("Straight", "Mirror"), hint="mirror: rotate the opposite joint alike")
-        with gui.add_folder("Whole body"):
+            inputs.add_buttons(("Straight", "Mirror"), self._press, hint="mirror: rotate the opposite joint alike")
+        with inputs.add_folder("Whole body"):
             self._turns = self._add_angles(lambda: 0)
-            self._height = gui.add_slider("height", -_REACH_M, _REACH_M, 0.01, 0.0, hint="metres above its place at rest")
-        reset = gui.add_button("Reset pose", icon="refresh")
-        save = gui.add_button("Save pose", icon="download", hint="as .npz, which --pose reads again")
-        on_user(self._joint, lambda handle, client: self._mark_joint())
-        on_user(self._height, lambda handle, client: state.move_root(1, handle.value))
-        buttons.on_click(lambda event: self._press(event.target.value))
-        reset.on_click(lambda event: state.reset_pose())
-        save.on_click(lambda event: self._save(event.client))
+            self._height = inputs.add_slider("height", -_REACH_M, _REACH_M, 0.01, 0.0, hint="metres above its place at rest")
+        inputs.add_button("Reset pose", lambda client: state.reset_pose(), icon="refresh")
+        inputs.add_button("Save pose", self._save, icon="download", hint="as .npz, which --pose reads again")
+        inputs.on_user(self._joint, lambda value: self._mark_joint())
+        inputs.on_user(self._height, lambda value: state.move_root(1, value))
         self._mark_joint()
 
     @property
@@ -74,7 +71,7 @@ class PoseTab:
 
     def _add_angles(self, joint: Callable[[], int]) -> AngleSliders:
         state = self._state
-        return AngleSliders(self._gui, lambda: state.pause().pose[joint()], lambda vector: state.turn_joint(joint(), vector))
+        return AngleSliders(self._inputs, lambda: state.pause().pose[joint()], lambda vector: state.turn_joint(joint(), vector))
 
     def _mark_joint(self) -> None:
         self._scene.chosen_joint = self.joint
@@ -88,6 +85,5 @@ class PoseTab:
             self._state.turn_joint(self.joint, np.zeros(3))
 
     def _save(self, client: Any) -> None:
-        if client is not None:
-            posed = self._state.posed
-            client.send_file_download("pose.npz", pose_file(posed.pose, posed.translation), save_immediately=True)
+        posed = self._state.posed
+        client.send_file_download("pose.npz", pose_file(posed.pose, posed.translation), save_immediately=True)

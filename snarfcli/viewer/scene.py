@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from snarfcli.viewer.body import Posed
+from snarfcli.viewer.gate import Gate
 from snarfcli.viewer.joints import global_turns, posed_joints, vector_from_turn
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.state import ViewerState
@@ -21,6 +22,7 @@ __all__ = ["BODY_COLOR", "ViewerScene"]
 BODY_COLOR = (205, 184, 168)
 """Colour of the body, sRGB: clay, on which shading is well visible."""
 
+_JOINTS_NODE, _HANDLE_NODE = "/skeleton/joints", "/handle"
 _BONE, _JOINT, _CHOSEN = (70, 80, 95), (255, 214, 102), (235, 94, 40)  # sRGB
 _SEE_THROUGH = 0.45  # opacity of a body with a visible skeleton
 _FIELD_OF_VIEW_RAD = 0.6
@@ -43,15 +45,22 @@ class ViewerScene:
 
     Args:
         server: server of viser.
+        gate: told what clients can click and drag.
         state: state of the viewer.
         choose_joint: called with the number of a joint that a user clicked.
         clock: returns the time, seconds.
     """
 
     def __init__(
-        self, server: Any, state: ViewerState, choose_joint: Callable[[int], None], clock: Callable[[], float] = time.monotonic
+        self,
+        server: Any,
+        gate: Gate,
+        state: ViewerState,
+        choose_joint: Callable[[int], None],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._server = server
+        self._gate = gate
         self._state = state
         self._skeleton = state.body.skeleton
         self._choose_joint = choose_joint
@@ -160,18 +169,22 @@ class ViewerScene:
         ball = trimesh.creation.icosphere(subdivisions=2, radius=0.015 * self.size)
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(joints), 1))
         balls = self._server.scene.add_batched_meshes_simple(
-            "/skeleton/joints", ball.vertices, ball.faces, turns, joints, lod="off", cast_shadow=False,
+            _JOINTS_NODE, ball.vertices, ball.faces, turns, joints, lod="off", cast_shadow=False,
             batched_colors=np.full((len(joints), 3), _JOINT, dtype=np.uint8), receive_shadow=False,
         )  # fmt: skip
-        balls.on_click(lambda event: self._choose_joint(int(event.instance_index)))
+        balls.on_click(self._gate.reaction(lambda event: self._choose_joint(event.instance_index)))
+        self._gate.add_clickable(_JOINTS_NODE, len(joints))
         bones = None
         if self._skeleton.bones:
             ends = joints[np.array(self._skeleton.bones)]
             bones = self._server.scene.add_line_segments("/skeleton/bones", ends, _BONE, thickness=0.007 * self.size)
         handle = self._server.scene.add_transform_controls(
-            "/handle", scale=0.13 * self.size, disable_axes=True, disable_sliders=True, depth_test=False, visible=False
+            _HANDLE_NODE, scale=0.13 * self.size, disable_axes=True, disable_sliders=True, depth_test=False, visible=False
         )
-        handle.on_update(lambda event: self.turn_chosen(event.target.wxyz, event.phase == "end", event.client_id))
+        self._gate.add_handle(_HANDLE_NODE)
+        handle.on_update(
+            self._gate.reaction(lambda event: self.turn_chosen(event.target.wxyz, event.phase == "end", event.client_id))
+        )
         return _SkeletonNodes(balls, bones, handle)
 
     def turn_chosen(self, wxyz: np.ndarray, is_over: bool, client_id: int | None) -> None:

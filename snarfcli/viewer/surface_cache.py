@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from snarfcli.bodies.skinning import skin_vertices
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
+from snarfcli.texts import one_line
 from snarfcli.viewer.body import (
     CanonicalRequest,
     CanonicalResult,
@@ -55,8 +56,8 @@ class SurfaceCache:
         is_first, self._latest = False, type(request)
         if error is not None:
             if not isinstance(error, EmptySurface | FullSurface):
-                log.error("the viewer continues after: %s: %s", type(error).__name__, error, exc_info=error)
-            self._failed[_key(request)] = str(error) or type(error).__name__
+                log.error("the viewer continues after: %s: %s", type(error).__name__, one_line(error, 300), exc_info=error)
+            self._failed[_key(request)] = one_line(error, 300)
         elif isinstance(result, CanonicalResult):
             is_first, self._canonical = self._canonical is None, result
         elif isinstance(result, ShapeResult):

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
+import socket
+import subprocess
 import sys
 import urllib.request
 from dataclasses import replace
@@ -133,10 +137,12 @@ def test_no_browser_if_not_wanted(served, opened):
 def test_who_listens_to_all_is_warned(served, opened, caplog):
     with caplog.at_level(logging.WARNING):
         server = served(host="0.0.0.0")
-    assert [record.message for record in caplog.records] == [
-        "host=0.0.0.0: all machines in the network can see and change the page"
-    ]
-    assert opened == [f"http://127.0.0.1:{server.port}"]
+    (record,) = caplog.records
+    assert record.message.startswith("host=0.0.0.0: whoever knows this address, with its token, can see and change the page")
+    assert record.message.endswith(f"http://{socket.gethostname()}:{server.port}")
+    assert server.access.token
+    assert server.access.token not in caplog.text
+    assert opened == [f"http://127.0.0.1:{server.port}/?token={server.access.token}"]
 
 
 def test_pose_files_are_on_the_shelf_and_the_first_one_plays(served):
@@ -171,19 +177,78 @@ def test_sequences_of_the_samples_are_on_the_shelf(served, config, toy, monkeypa
     assert server.controls.motion.names.options == ("none",)
 
 
-def test_ctrl_c_stops_the_server(config, monkeypatch, capsys):
-    ports: list[int] = []
+def test_ctrl_c_leaves_at_once(config, monkeypatch, capsys):
+    servers: list[ViewServer] = []
 
     def interrupted(server: ViewServer) -> None:
-        ports.append(server.port)
+        servers.append(server)
         raise KeyboardInterrupt
 
+    def leave(code: int) -> None:
+        raise SystemExit(code)
+
+    before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(ViewServer, "wait", interrupted)
-    assert main(["view", "--port", "auto", "--no-open", "--pose", pose_file("wave.npz"), "up=y", "resolution=24"]) == 130
+    monkeypatch.setattr(view.os, "_exit", leave)
+    try:
+        with pytest.raises(SystemExit) as left:
+            main(["view", "--port", "auto", "--no-open", "--pose", pose_file("wave.npz"), "up=y", "resolution=24"])
+    finally:
+        signal.signal(signal.SIGINT, before)
+        servers[0].stop()
+    assert left.value.code == 130
     assert "snarf view: interrupted" in capsys.readouterr().err
-    check_port("127.0.0.1", ports[0])
-    monkeypatch.setattr(ViewServer, "wait", lambda server: None)
+
+
+def test_a_server_that_ends_by_itself_leaves_its_port(config, monkeypatch):
+    ports: list[int] = []
+    monkeypatch.setattr(ViewServer, "wait", lambda server: ports.append(server.port))
     assert run(config) == 0
+    check_port("127.0.0.1", ports[0])
+
+
+ENDLESS = """
+import sys
+from types import SimpleNamespace
+
+import torch
+from toy_avatar import ToyAvatar
+
+from snarfcli.avatar import Avatar
+from snarfcli.cli.main import main
+
+
+class Endless(ToyAvatar):
+    def canonical_logits(self, points_c, pose):
+        print("computing", flush=True)
+        while True:
+            torch.ones(10**6).sum()  # native code
+
+
+avatar = Endless()
+avatar.config = SimpleNamespace(model=SimpleNamespace(name="capsules"), condition=SimpleNamespace(name="none"))
+Avatar.load = classmethod(lambda cls, path, device: avatar)
+sys.exit(main(["view", "--no-open", "ckpt=toy.pt", "data=meshes", "subject=a"]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT for one process")
+def test_ctrl_c_ends_the_process_while_a_surface_is_computed(tmp_path):
+    (tmp_path / "toy.pt").write_bytes(b"the toy")
+    child = subprocess.Popen(
+        [sys.executable, "-c", ENDLESS], cwd=tmp_path, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )  # fmt: skip
+    lines: list[str] = []
+    try:
+        while not any("Ctrl-C" in line for line in lines) or not any("computing" in line for line in lines):
+            lines.append(child.stdout.readline())
+            assert lines[-1], child.stderr.read()
+        child.send_signal(signal.SIGINT)
+        _, errors = child.communicate(timeout=300)
+    finally:
+        child.kill()
+    assert (child.returncode, errors) == (130, "snarf view: interrupted\n")
 
 
 def test_without_viser_one_line_before_any_work(config, monkeypatch, capsys):

@@ -20,7 +20,6 @@ from snarfcli.samples.store import SampleStore
 from snarfcli.samples.writing import (
     SequenceWriter,
     discard_samples,
-    hold_folder,
     remove_leftovers,
     require_same_settings,
     settings_digest,
@@ -266,16 +265,6 @@ def test_discarding_spares_what_is_not_ours(folder: Path) -> None:
     (folder / "notes.txt").write_text("mine")
     discard_samples(folder)
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
-
-
-def test_a_folder_is_held_by_one(tmp_path: Path) -> None:
-    with hold_folder(tmp_path / "a"):
-        with pytest.raises(UserError, match="another snarf preprocess"), hold_folder(tmp_path / "a"):
-            pass
-        with hold_folder(tmp_path / "b"):
-            pass
-    with hold_folder(tmp_path / "a"):
-        pass
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EMFILE, errno.EIO])

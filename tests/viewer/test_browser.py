@@ -16,7 +16,7 @@ from toy_viewer import SMALL
 from snarfcli.motions import Motion
 from snarfcli.viewer.server import ViewServer
 
-pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
+viser = pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install playwright")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 if CHROMIUM is None:
@@ -34,10 +34,27 @@ def load_motion(name: str):
     return Motion(name, poses, np.zeros((60, 3)), 30.0), None
 
 
-@pytest.fixture
-def page():
+ATTACK = "{window.attacked = 1} <img src=x onerror='window.attacked = 1'>"
+
+# A page of another origin that tries to open the viewer's WebSocket and to read its page.
+FOREIGN = """<body><script>
+async function attack(port, protocol) {
+  const opened = await new Promise(done => {
+    const socket = new WebSocket(`ws://127.0.0.1:${port}`, [protocol]);
+    socket.onopen = () => done(true);
+    socket.onerror = () => done(false);
+  });
+  const read = await fetch(`http://127.0.0.1:${port}/`).then(() => true, () => false);
+  return [opened, read];
+}
+</script></body>"""
+
+
+@pytest.fixture(params=["127.0.0.1", "0.0.0.0"])
+def page(request):
     look = replace(SMALL, weight_colors=True)
-    server = ViewServer(ToyAvatar(), look, motions=["bend"], load_motion=load_motion, facts={"subject": "toy"})
+    facts = {"subject": ATTACK}
+    server = ViewServer(ToyAvatar(), look, host=request.param, motions=["bend"], load_motion=load_motion, facts=facts)
     with playwright.sync_playwright() as program:
         browser = program.chromium.launch(executable_path=CHROMIUM, args=list(_FLAGS))
         page = browser.new_page(viewport={"width": 1000, "height": 600})
@@ -45,7 +62,7 @@ def page():
         page.foreign = []
         page.on("request", lambda request: page.foreign.append(request.url) if _is_foreign(request.url) else None)
         page.on("pageerror", lambda error: page.foreign.append(str(error)))
-        page.goto(f"http://127.0.0.1:{server.port}")
+        page.goto(server.address)
         page.server = server
         yield page
         browser.close()
@@ -92,3 +109,10 @@ def test_the_body_is_seen_posed_and_played_and_nothing_comes_from_elsewhere(page
     assert page.server.state.motion.name == "bend"
     assert not page.server.state.player.is_playing
     assert not page.foreign
+    assert page.evaluate("window.attacked") is None  # though the avatar's facts are code
+    assert "token" not in page.url
+
+    foreign = page.context.browser.new_page()
+    foreign.route("http://127.0.0.1:9/", lambda route: route.fulfill(body=FOREIGN, content_type="text/html"))
+    foreign.goto("http://127.0.0.1:9/")
+    assert foreign.evaluate(f"attack({page.server.port}, 'viser-v{viser.__version__}')") == [False, False]

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from types import SimpleNamespace
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,15 +13,23 @@ from snarfcli.viewer.joints import vector_of
 class Slider:
     """Like a slider of viser, set by the program or moved by a client."""
 
+    react: Callable[[float], None]
+
     def __init__(self, *_: object, **__: object) -> None:
         self.value = 0.0
 
-    def on_update(self, updated) -> None:
-        self._updated = updated
-
     def move(self, value: float) -> None:
         self.value = value
-        self._updated(SimpleNamespace(client="a client", target=self))
+        self.react(value)
+
+
+class PlainInputs:
+    """Makes such sliders."""
+
+    add_slider = Slider
+
+    def on_user(self, slider: Slider, react: Callable[[float], None]) -> None:
+        slider.react = react
 
 
 class Joint:
@@ -29,7 +37,7 @@ class Joint:
 
     def __init__(self) -> None:
         self.vector = np.zeros(3)
-        self.angles = AngleSliders(SimpleNamespace(add_slider=Slider), lambda: self.vector, self.turn)
+        self.angles = AngleSliders(PlainInputs(), lambda: self.vector, self.turn)
 
     def turn(self, vector: np.ndarray) -> None:
         self.vector = vector

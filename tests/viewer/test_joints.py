@@ -46,6 +46,8 @@ def test_joints_that_are_no_part_of_a_person_keep_their_names():
     assert joint_labels(ToyAvatar().skeleton) == {"joint_1": 1}
     twins = Skeleton(("root", "Tail", "Tail"), (-1, 0, 1), torch.zeros(3, 3), torch.zeros(3, 3))
     assert list(joint_labels(twins).values()) == [1, 2]
+    hostile = Skeleton(("root", "\x1b[2J\n" + "x" * 10**5, ""), (-1, 0, 1), torch.zeros(3, 3), torch.zeros(3, 3))
+    assert joint_labels(hostile) == {"[2J " + "x" * 56: 1, "joint 2": 2}
     assert joint_labels(Skeleton(("root",), (-1,), torch.zeros(1, 3), torch.zeros(1, 3))) == {}
 
 

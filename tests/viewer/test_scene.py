@@ -9,6 +9,7 @@ from toy_avatar import RADIUS
 from toy_viewer import PATIENCE_S, Watched
 
 from snarfcli.meshing.skinned import SkinnedSurface
+from snarfcli.viewer.gate import Gate
 from snarfcli.viewer.picture import Picture
 from snarfcli.viewer.scene import ViewerScene
 
@@ -31,7 +32,7 @@ def watched():
 
 @pytest.fixture
 def scene(server, watched) -> ViewerScene:
-    return ViewerScene(server, watched.state, lambda joint: None, lambda: watched.now)
+    return ViewerScene(server, Gate(), watched.state, lambda joint: None, lambda: watched.now)
 
 
 def grown_as_bent(surface: SkinnedSurface, pose: Tensor) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import re
 import socket
 import urllib.request
 from dataclasses import replace
@@ -20,7 +21,7 @@ from snarfcli.errors import UserError
 from snarfcli.motions import Motion
 from snarfcli.viewer import server as server_module
 from snarfcli.viewer.joints import angles_of
-from snarfcli.viewer.server import ViewServer, can_open_browser, check_port, is_loopback
+from snarfcli.viewer.server import ViewServer, can_open_browser, check_port
 from snarfcli.viewer.state import ViewerState
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install 'snarf[view]'")
@@ -67,8 +68,37 @@ def test_the_page_is_served_on_this_machine_only_and_needs_no_other(server):
     assert server.server.get_host() == "127.0.0.1"
 
 
+HOSTILE = "{alert(1)} <img src=x onerror=alert(1)> [a](javascript:b) | \x1b]0;c\x07\n# d"
+
+
+def broken_motion(name: str):
+    raise UserError(f"no motion {name}")
+
+
+def test_texts_of_a_downloaded_avatar_are_inert_on_the_page():
+    facts = {"subject": HOSTILE, "data": HOSTILE, HOSTILE: HOSTILE}
+    avatar = ToyAvatar()
+    avatar.skeleton = replace(avatar.skeleton, names=("root", HOSTILE))
+    server = ViewServer(avatar, SMALL, motions=[HOSTILE, "x" * 10**5], load_motion=broken_motion, facts=facts)
+    try:
+        with Page(server) as page:
+            page.until_text("vertices")
+            page.change("Motion", page.options("Motion")[1])
+            page.until_text("no motion")
+            for text in page.markdown():
+                shown = text.removeprefix("| | |\n|---|---|\n").replace("&nbsp;", "").replace("  \n", "")
+                assert not re.search(r"[{}<>\[\]()\x1b#]", re.sub(r"&#\d+;", "", shown)), text
+            assert any("&#123;alert&#40;1&#41;&#125;" in text for text in page.markdown())
+            for label in ("Motion", "Joint"):
+                options = page.options(label)
+                assert all(option.isprintable() and len(option) <= 80 for option in options)
+                assert any("alert(1)" in option for option in options)
+    finally:
+        server.stop()
+
+
 def test_what_one_changes_all_see(server):
-    with Page(server.server) as one, Page(server.server) as other:
+    with Page(server) as one, Page(server) as other:
         other.until_text("vertices")
         other.expect()
         one.change("turn z", 30.0)
@@ -82,7 +112,7 @@ def test_what_one_changes_all_see(server):
         other.change("height", 0.5)
         other.until_node("/avatar/plain", "vertices")
         assert server.state.posed.translation[1] == 0.5
-        with Page(server.server) as late:
+        with Page(server) as late:
             late.expect()
             other.change("Reset pose", True)
             late.until_node("/avatar/plain", "vertices")
@@ -98,7 +128,7 @@ def clock(monkeypatch):
 
 
 def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(clock, server):
-    with Page(server.server) as page:
+    with Page(server) as page:
         page.change("Motion", "bend")
         page.until(lambda message: message.get("updates", {}).get("label") == "Pause")
         clock.now = 1.5 / 20  # in the middle of frame 1
@@ -122,7 +152,7 @@ def test_a_motion_plays_and_the_sliders_follow_when_it_is_held(clock, server):
 
 
 def test_a_slider_changes_one_angle_of_a_pose_that_plays(server):
-    with Page(server.server) as page:
+    with Page(server) as page:
         page.until_text("vertices")
         page.expect()
         with server.state._lock:  # no picture before it plays, so the sliders stay at zero
@@ -136,7 +166,7 @@ def test_a_slider_changes_one_angle_of_a_pose_that_plays(server):
 
 
 def test_the_sliders_show_a_motion_of_one_frame(server):
-    with Page(server.server) as page:
+    with Page(server) as page:
         page.until_text("vertices")
         page.change("Motion", "pose")
         turn = page.uuid("turn z")
@@ -145,7 +175,7 @@ def test_the_sliders_show_a_motion_of_one_frame(server):
 
 
 def test_every_look(server):
-    with Page(server.server) as page:
+    with Page(server) as page:
         page.until_text("vertices")
         page.change("Weights in colour", True)
         page.until(lambda message: message["type"] == "GlbMessage")
@@ -168,7 +198,7 @@ def test_every_look(server):
 def test_a_click_chooses_a_joint_and_the_handle_turns_it():
     server = ViewServer(ToyAvatar(3), SMALL)
     try:
-        with Page(server.server) as page:
+        with Page(server) as page:
             page.change("Skeleton", True)
             page.until(lambda message: message["type"] == "TransformControlsMessage")
             server.controls.pose.choose_joint(2)
@@ -188,7 +218,7 @@ def test_a_click_chooses_a_joint_and_the_handle_turns_it():
 def test_who_leaves_lets_go_of_the_handle(server, monkeypatch):
     left = queue.Queue()
     monkeypatch.setattr(server.scene, "let_go", left.put)
-    with Page(server.server):
+    with Page(server):
         (client_id,) = server.server.get_clients()
     assert left.get(timeout=PATIENCE_S) == client_id
 
@@ -198,7 +228,7 @@ def test_an_avatar_without_weights_has_no_choice_of_surface():
     avatar.model.has_skinning_weights = False
     server = ViewServer(avatar, SMALL)
     try:
-        with Page(server.server) as page:
+        with Page(server) as page:
             page.until_text("surface in")
             inputs = [message["props"] for message in page.messages if "label" in message.get("props", {})]
             shown = {props["label"]: props for props in inputs}
@@ -212,7 +242,7 @@ def test_an_avatar_without_weights_has_no_choice_of_surface():
 def test_a_skeleton_of_one_joint_turns_as_a_whole():
     server = ViewServer(OneJoint(), replace(SMALL, shows_skeleton=True))
     try:
-        with Page(server.server) as page:
+        with Page(server) as page:
             page.until_text("vertices")
             folders = [message["props"] for message in page.messages if message["type"] == "GuiFolderMessage"]
             assert {props["label"]: props["visible"] for props in folders} == {"Joint": False, "Whole body": True}
@@ -256,12 +286,3 @@ def test_a_stopped_server_leaves_its_port():
 )
 def test_a_browser_is_opened_only_where_it_is_seen(environment, platform, can):
     assert can_open_browser(environment, platform) is can
-
-
-def test_loopback():
-    assert is_loopback("127.0.0.1")
-    assert is_loopback("localhost")
-    assert is_loopback("::1")
-    assert not is_loopback("0.0.0.0")
-    assert not is_loopback("192.168.0.2")
-    assert not is_loopback("example.org")

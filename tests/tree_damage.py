@@ -126,6 +126,8 @@ def damaged_json(rng: random.Random, content: bytes) -> bytes:
 
 def damaged_array(rng: random.Random, array: np.ndarray) -> np.ndarray:
     """Return an array with another type, shape or other values."""
+    if array.dtype.kind == "M":  # changed before; NumPy does not turn it into any type
+        return array
     kind = rng.randrange(7)
     with np.errstate(all="ignore"):
         if kind == 0:

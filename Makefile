@@ -15,7 +15,7 @@ help:
 	@echo "make setup     install snarf into $(VENV)"
 	@echo "make demo      run the whole pipeline on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
 	@echo "make test      run the tests"
-	@echo "make fuzz      read 20,000 damaged files with every file reader"
+	@echo "make fuzz      read 20,000 damaged files with every file reader, 5,000 with slow ones"
 	@echo "make trust     crash, disturb and attack the commands, and measure their memory, for some hours (Linux)"
 	@echo "make sanitize  test the native library built with AddressSanitizer and UndefinedBehaviorSanitizer (Linux)"
 	@echo "make lint      check style, format and types of the code"
@@ -41,7 +41,7 @@ test: $(INSTALLED)
 	$(VENV)/bin/python -m pytest -q -n auto
 
 fuzz: $(INSTALLED)
-	$(VENV)/bin/python tools/fuzz_readers.py --count 20000
+	$(VENV)/bin/python tools/fuzz_readers.py
 
 # The short forms of these are among the tests. What is promised is in docs/promises.md.
 trust: $(INSTALLED)

@@ -14,11 +14,11 @@ import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, raise_system_error
 from snarfcli.texts import one_line
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "find_temporaries",
     "flush_to_disk",
     "list_npz",
+    "map_npy",
     "read_json",
     "read_npy",
     "read_npz",
@@ -157,13 +158,14 @@ def read_json(path: str | Path, what: str = "file") -> Any:
 
     Raises:
         UserError: the file is missing, is not JSON or is larger than 32 MiB.
+        OSError, MemoryError: the system cannot read it.
     """
     path = Path(path)
     _check_regular(path, what, "a")
     if path.stat().st_size > _MAX_JSON_BYTES:
         raise UserError(f"{what} {path} is larger than {_MAX_JSON_BYTES // 2**20} MiB; name another file")
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:  # bad UTF-8, bad JSON, a number of over 4300 digits
         raise UserError(f"{what} {path} is not valid JSON ({one_line(error, 200)}); make it again") from None
     except RecursionError:
@@ -190,8 +192,9 @@ def read_npz(
         objects: returns the content of a pickle without executing it, for arrays of objects; without it, these are rejected.
 
     Raises:
-        UserError: the file is missing, cannot be opened, is not a zip archive, is truncated, damaged, encrypted, too large or a
-            zip bomb; an array occurs twice, or holds pickled objects or records.
+        UserError: the file is missing, is not a zip archive, is truncated, damaged, encrypted, too large or a zip bomb; an
+            array occurs twice, or holds pickled objects or records.
+        OSError, MemoryError: the system cannot read it.
     """
     path = Path(path)
     _check_regular(path, what, "an .npz")
@@ -212,15 +215,16 @@ def read_npz(
     except UserError:
         raise
     except Exception as error:  # zipfile raises many kinds; tests/fuzz_targets.py found over ten
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise UserError(f"{what} {path} is damaged ({one_line(reason, 200)}); copy or download it again") from None
+        raise_system_error(error, path)
+        raise UserError(f"{what} {path} is damaged ({one_line(error, 200)}); copy or download it again") from None
 
 
 def list_npz(path: str | Path, what: str = "file") -> tuple[str, ...]:
     """Return the names of the arrays of an `.npz` file, without reading them.
 
     Raises:
-        UserError: the file is missing, cannot be opened, or is not a zip archive.
+        UserError: the file is missing, or is not a zip archive.
+        OSError: the system cannot read it.
     """
     path = Path(path)
     _check_regular(path, what, "an .npz")
@@ -233,8 +237,8 @@ def list_npz(path: str | Path, what: str = "file") -> tuple[str, ...]:
     except UserError:
         raise
     except Exception as error:  # zipfile raises many kinds
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise UserError(f"{what} {path} is damaged ({one_line(reason, 200)}); copy or download it again") from None
+        raise_system_error(error, path)
+        raise UserError(f"{what} {path} is damaged ({one_line(error, 200)}); copy or download it again") from None
 
 
 def read_npy(
@@ -249,8 +253,8 @@ def read_npy(
         objects: see `read_npz`.
 
     Raises:
-        UserError: the file is missing, cannot be opened, is not an `.npy` file, is truncated, too large, or holds pickled
-            objects or records.
+        UserError: the file is missing, is not an `.npy` file, is truncated, too large, or holds pickled objects or records.
+        OSError, MemoryError: the system cannot read it.
     """
     path = Path(path)
     _check_regular(path, what, "an .npy")
@@ -261,10 +265,33 @@ def read_npy(
         with path.open("rb") as file:
             array = _read_array(file, size, f"{what} {path}", objects)
     except OSError as error:
-        raise UserError(f"{what} {path} cannot be read ({error.strerror or error})") from None
+        raise_system_error(error, path)
+        raise UserError(f"{what} {path} is damaged ({one_line(error, 200)}); copy or download it again") from None
     if array is None:
         raise UserError(f"{what} {path} is not an .npy file, or is truncated; copy or download it again")
     return array
+
+
+def map_npy(path: str | Path, shape: tuple[int, ...], dtype: type, what: str = "file") -> np.ndarray:
+    """Memory-map the array of an `.npy` file.
+
+    Raises:
+        UserError: the file is missing, damaged, or its array has another shape or type.
+        OSError: the system cannot read it.
+    """
+    path = Path(path)
+    _check_regular(path, what, "an .npy")
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = _read_header(file, size, f"{what} {path}")
+    wanted = (np.dtype(dtype), "C", shape)
+    if head is None or head.offset + head.dtype.itemsize * math.prod(head.shape) != size:
+        raise UserError(f"{what} {path} is not an .npy file, or is truncated")
+    if head[:3] != wanted:
+        raise UserError(f"{what} {path}: wanted {wanted[0]} {list(shape)}, got {head.dtype} {list(head.shape)[:9]}")
+    if not math.prod(shape):
+        return np.zeros(shape, dtype)
+    return np.memmap(path, dtype, "r", head.offset, shape)
 
 
 def _check_regular(path: Path, what: str, kind: str) -> None:
@@ -311,6 +338,45 @@ def _read_array(
     NumPy's own reader trusts any length in the header, and evaluates the header as Python.
     """
     damaged = UserError(f"{subject} is damaged; copy or download the file again")
+    head = _read_header(stream, size, subject)
+    if head is None:
+        return None
+    if head.dtype.hasobject and objects is not None:
+        return _boxed(objects(stream.read(size)))
+    if head.dtype.hasobject:
+        raise UserError(f"{subject} holds pickled objects, which are never executed; save plain arrays")
+    count = math.prod(head.shape)
+    if count * head.dtype.itemsize != size - head.offset or (head.dtype.itemsize == 0 and count > 1):
+        raise damaged
+    content = bytearray(count * head.dtype.itemsize)
+    filled, view = 0, memoryview(content)
+    while filled < len(content):
+        got = stream.readinto(view[filled : filled + 2**20])
+        if not got:
+            raise damaged
+        filled += got
+    if stream.read(1):  # at the end of a member, zipfile compares the checksum
+        raise damaged
+    try:
+        flat = np.frombuffer(content, head.dtype, count) if content else np.zeros(count, head.dtype)
+        return flat.reshape(head.shape, order=head.order)
+    except (ValueError, TypeError):  # such as too many dimensions
+        raise damaged from None
+
+
+class _Header(NamedTuple):
+    """The header of an array."""
+
+    dtype: np.dtype
+    order: Literal["C", "F"]
+    shape: tuple[int, ...]
+    offset: int
+    """Number of bytes before the values."""
+
+
+def _read_header(stream: io.BufferedIOBase, size: int, subject: str) -> _Header | None:
+    """Read the header of an array of `size` bytes in NumPy's `.npy` format; return None for another format."""
+    damaged = UserError(f"{subject} is damaged; copy or download the file again")
     magic = stream.read(8)
     if magic[:6] != b"\x93NUMPY":
         return None
@@ -331,31 +397,11 @@ def _read_array(
         dtype = np.dtype(descr)
     except Exception:  # NumPy raises several kinds for a word that is not a type
         raise damaged from None
-    if dtype.hasobject and objects is not None:
-        return _boxed(objects(stream.read(size)))
-    if dtype.hasobject:
-        raise UserError(f"{subject} holds pickled objects, which are never executed; save plain arrays")
     numbers = [number.rstrip("L") for number in shape.replace(" ", "").split(",") if number]
-    if any(len(number) > 18 for number in numbers):  # over 2^59
+    if not dtype.hasobject and any(len(number) > 18 for number in numbers):  # over 2^59
         raise damaged
-    lengths = tuple(int(number) for number in numbers)
-    count = math.prod(lengths)
-    if count * dtype.itemsize != size - 8 - width - length or (dtype.itemsize == 0 and count > 1):
-        raise damaged
-    content = bytearray(count * dtype.itemsize)
-    filled, view = 0, memoryview(content)
-    while filled < len(content):
-        got = stream.readinto(view[filled : filled + 2**20])
-        if not got:
-            raise damaged
-        filled += got
-    if stream.read(1):  # at the end of a member, zipfile compares the checksum
-        raise damaged
-    try:
-        flat = np.frombuffer(content, dtype, count) if content else np.zeros(count, dtype)
-        return flat.reshape(lengths, order="F" if order == "True" else "C")
-    except (ValueError, TypeError):  # such as too many dimensions
-        raise damaged from None
+    lengths = () if dtype.hasobject else tuple(int(number) for number in numbers)
+    return _Header(dtype, "F" if order == "True" else "C", lengths, 8 + width + length)
 
 
 def _boxed(value: Any) -> np.ndarray:

@@ -10,11 +10,12 @@ import zlib
 from collections.abc import Callable
 
 import numpy as np
+from fuzz_own_targets import OWN_TARGETS
 from fuzzing import Target
 
 __all__ = ["TARGETS"]
 
-TARGETS: list[Callable[[], Target]] = []
+TARGETS: list[Callable[[], Target]] = [*OWN_TARGETS]
 """Functions that each return one target with the name of the function."""
 
 

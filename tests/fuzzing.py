@@ -26,7 +26,7 @@ from fuzz_damage import DAMAGES
 
 from snarfcli.errors import UserError
 
-__all__ = ["Target", "broken_file", "check_target", "find_failures", "scratch_folder"]
+__all__ = ["Target", "broken_file", "check_target", "find_failures", "peak_memory", "scratch_folder"]
 
 MAX_CPU_SECONDS = 5.0  # processor time, which does not depend on how busy the machine is
 MAX_GROWTH = 2**30
@@ -50,6 +50,13 @@ class Target:
     """The public reader."""
     extra: Callable[[random.Random, bytes], bytes] | None = None
     """Damage a seed file with knowledge of its format: wrong shapes, other types, cycles."""
+    extra_share: float = 0.4
+    """Share of the files that `extra` damages. Other damage rarely gets beyond the checksums of an archive."""
+    cost: int = 1
+    """How many files of a fast reader take as long as one of this reader; so many fewer are read."""
+    unpack: Callable[[bytes, Path], Path] | None = None
+    """Write the files that the bytes stand for below a folder and return the path to read, for a reader of a folder. All damage
+    is that of `extra` then."""
 
 
 class _TookTooLong(BaseException):
@@ -89,24 +96,31 @@ def find_failures(target: Target, indices: Iterable[int], seed: int, folder: Pat
     path = scratch / f"fuzz{target.suffix}"
     seeds = target.seeds()
     assert seeds, f"{target.name}: no seeds"
-    for number, content in enumerate(seeds):
+
+    def put(content: bytes) -> Path:
         path.write_bytes(content)
-        failure, message = _try(target, path, _peak_memory())
+        if target.unpack is None:
+            return path
+        shutil.rmtree(scratch / "fuzzed", ignore_errors=True)
+        return target.unpack(content, scratch / "fuzzed")
+
+    for number, content in enumerate(seeds):
+        given = put(content)
+        failure, message = _try(target, given, peak_memory())
         if failure or message:
             yield f"{target.name}: seed {number} must be a good file: {failure or message}"
             return
-    peak = _peak_memory()
+    peak = peak_memory()
     for index in indices:
         content = broken_file(target, seed, index, seeds)
         (scratch / "index").write_text(str(index))
-        path.write_bytes(content)
-        failure, _ = _try(target, path, peak)
+        failure, _ = _try(target, put(content), peak)
         if failure:
             folder.mkdir(parents=True, exist_ok=True)
             kept = folder / f"{target.name}-{seed}-{index}{target.suffix}"
             kept.write_bytes(content)
             yield f"{target.name}: file {index} of seed {seed}, kept as {kept}: {failure}"
-            peak = max(peak, _peak_memory() - MAX_GROWTH // 2)
+            peak = max(peak, peak_memory() - MAX_GROWTH // 2)
 
 
 def broken_file(target: Target, seed: int, index: int, seeds: list[bytes] | None = None) -> bytes:
@@ -114,9 +128,9 @@ def broken_file(target: Target, seed: int, index: int, seeds: list[bytes] | None
     rng = random.Random(f"{target.name}/{seed}/{index}")
     seeds = target.seeds() if seeds is None else seeds
     content = rng.choice(seeds)
-    if target.extra is not None and rng.random() < 0.4:
+    if target.extra is not None and (target.unpack is not None or rng.random() < target.extra_share):
         content = target.extra(rng, content)
-        if rng.random() < 0.6:
+        if target.unpack is not None or rng.random() < 0.2 + target.extra_share:
             return content
     for _ in range(rng.choice([1, 1, 1, 2, 2, 4])):
         content = rng.choice(DAMAGES)(rng, content, rng.choice(seeds))
@@ -154,7 +168,7 @@ def _try(target: Target, path: Path, peak: int) -> tuple[str, str]:
     cpu_seconds = time.process_time() - start
     if not failure and cpu_seconds > MAX_CPU_SECONDS:
         failure = f"took {cpu_seconds:.1f} s, wanted at most {MAX_CPU_SECONDS:g}"
-    if not failure and (growth := _peak_memory() - peak) > MAX_GROWTH:
+    if not failure and (growth := peak_memory() - peak) > MAX_GROWTH:
         failure = f"took {growth / 2**30:.1f} GiB of memory, wanted at most 1"
     if not failure and message:
         failure = _wrong_message(message, path)
@@ -219,7 +233,7 @@ def _audit(event: str, arguments: tuple) -> None:
         raise _Forbidden(f"open for writing: {arguments!r:.200}")
 
 
-def _peak_memory() -> int:
+def peak_memory() -> int:
     """Return the peak memory of this process, bytes; 0 where the system does not report it."""
     try:
         import resource

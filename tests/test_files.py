@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 import torch
 
+from snarfcli import files
+from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError
 from snarfcli.files import (
     atomic_path,
     list_npz,
+    map_npy,
     read_json,
     read_npy,
     read_npz,
@@ -23,6 +26,7 @@ from snarfcli.files import (
     write_json,
     write_tensors,
 )
+from snarfcli.formats.torch_files import read_plain_torch, read_torch
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
@@ -257,3 +261,46 @@ def test_npy_files_that_are_none_end_in_one_line(tmp_path: Path) -> None:
         read_npy(tmp_path / "longer.npy", max_bytes=8)
     with pytest.raises(UserError, match="is a folder"):
         read_npy(tmp_path)
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EMFILE, errno.EIO, errno.ENOMEM])
+def test_errors_of_the_system_are_not_damage(number, tmp_path, monkeypatch):
+    np.savez(tmp_path / "a.npz", x=np.arange(3))
+    np.save(tmp_path / "a.npy", np.arange(3))
+    torch.save({"x": 1}, tmp_path / "a.pt")
+
+    def failing(*_, **__):
+        raise OSError(number, os.strerror(number))  # as of a read, without a name
+
+    monkeypatch.setattr(Path, "open", failing)
+    readers = ((read_npz, "a.npz"), (list_npz, "a.npz"), (read_npy, "a.npy"), (read_torch, "a.pt"), (read_plain_torch, "a.pt"))
+    for read, name in readers:
+        with pytest.raises(OSError, match=os.strerror(number)) as caught:
+            read(tmp_path / name)
+        assert caught.value.filename == str(tmp_path / name)
+        assert "damaged" not in str(user_message(caught.value))
+
+
+def test_too_little_memory_is_not_damage(tmp_path, monkeypatch):
+    np.savez(tmp_path / "a.npz", x=np.arange(3))
+    monkeypatch.setattr(files, "_read_array", lambda *_: bytearray(2**62))
+    with pytest.raises(MemoryError, match=r"not enough memory to read .*a\.npz; close other programs"):
+        read_npz(tmp_path / "a.npz")
+
+
+def test_a_mapped_array_is_that_of_its_file(tmp_path):
+    array = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
+    np.save(tmp_path / "a.npy", array)
+    got = map_npy(tmp_path / "a.npy", (2, 3, 4), np.uint16)
+    np.testing.assert_array_equal(got, array)
+    assert not got.flags.writeable
+    np.save(tmp_path / "none.npy", array[:0])
+    assert map_npy(tmp_path / "none.npy", (0, 3, 4), np.uint16).shape == (0, 3, 4)
+    for shape, dtype, message in (((2, 3, 5), np.uint16, "wanted uint16"), ((2, 3, 4), np.int16, "wanted int16")):
+        with pytest.raises(UserError, match=message):
+            map_npy(tmp_path / "a.npy", shape, dtype)
+    content = (tmp_path / "a.npy").read_bytes()
+    for damaged in (content[:-1], content + b"x", b"", content.replace(b"(2, 3, 4)", b"(2, 3, 9)")):
+        (tmp_path / "a.npy").write_bytes(damaged)
+        with pytest.raises(UserError, match=r"a\.npy is not an \.npy file, or is truncated"):
+            map_npy(tmp_path / "a.npy", (2, 3, 4), np.uint16)

@@ -26,6 +26,7 @@ LAYERS = (
     ("networks",),
     (
         "checks",
+        "descriptions",
         "files",
         "formats",
         "hydra_config",

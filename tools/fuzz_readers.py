@@ -1,7 +1,9 @@
 """Read damaged files with every file reader and report the failures: the long form of `tests/test_fuzz.py`.
 
-    python tools/fuzz_readers.py --count 20000
-    python tools/fuzz_readers.py --count 20000 --only bvh gltf
+    python tools/fuzz_readers.py
+    python tools/fuzz_readers.py --count 1000 --only bvh gltf
+    python tools/fuzz_readers.py --count 5000 --seed 2 --only own     # the package's own formats
+    python tools/fuzz_readers.py --count 5000 --only own     # readers of the package's own formats
 
 Each reader runs in its own process with limited memory, so that a crash or a decompression bomb ends only that process; the
 file that caused it is kept. The exit code is 1 if a file was mishandled.
@@ -19,9 +21,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from fuzz_own_targets import OWN_TARGETS
 from fuzz_targets import TARGETS
 from fuzzing import find_failures, scratch_folder
 
+_COUNT = 20_000
 _MAX_FAILURES = 20
 # Address space beyond that of the imported modules: far more than the 1 GiB a file may cost, since not all of it is used.
 _SPARE_ADDRESSES = 3 * 2**30
@@ -30,17 +34,21 @@ _SPARE_ADDRESSES = 3 * 2**30
 def main() -> int:
     names = [make.__name__ for make in TARGETS]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=20000, help="damaged files per reader")
+    parser.add_argument("--count", type=int, help="damaged files per reader; by default 20,000, and 5,000 for slow ones")
     parser.add_argument("--seed", type=int, default=1, help="seed of the damage")
-    parser.add_argument("--only", nargs="+", metavar="NAME", choices=names, help=f"readers: {', '.join(names)}")
+    parser.add_argument(
+        "--only", nargs="+", metavar="NAME", choices=["own", *names],
+        help=f"readers; own for those of the package's own formats: {', '.join(names)}",
+    )  # fmt: skip
     parser.add_argument("--folder", type=Path, default=Path("outputs/fuzz"), help="folder for the failing files")
     parser.add_argument("--child", nargs=2, metavar=("START", "SCRATCH"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
         return _read_files(options.only[0], int(options.child[0]), Path(options.child[1]), options)
-    total = 0
-    for name in options.only or names:
+    total, wanted = 0, options.count
+    for name in _chosen(options.only or names):
         start = time.monotonic()
+        options.count = wanted or _COUNT // next(make for make in TARGETS if make.__name__ == name)().cost
         failures = _supervise(name, options)
         total += len(failures)
         seconds = time.monotonic() - start
@@ -48,6 +56,12 @@ def main() -> int:
         for failure in failures:
             print("    " + failure.replace("\n", "\n    "), flush=True)
     return 1 if total else 0
+
+
+def _chosen(names: list[str]) -> list[str]:
+    """Return the names of readers, with those of the package's own formats in place of "own"."""
+    own = [make.__name__ for make in OWN_TARGETS]
+    return list(dict.fromkeys(one for name in names for one in (own if name == "own" else [name])))
 
 
 def _supervise(name: str, options: argparse.Namespace) -> list[str]:
@@ -72,7 +86,7 @@ def _supervise(name: str, options: argparse.Namespace) -> list[str]:
                 failures.append(f"{name}: could not start (exit code {child.returncode})\n{end}")
                 break
             options.folder.mkdir(parents=True, exist_ok=True)
-            (file,) = scratch.glob("fuzz*")
+            (file,) = (path for path in scratch.glob("fuzz*") if path.is_file())
             kept = options.folder / f"{name}-{options.seed}-{index}{file.suffix}"
             shutil.copyfile(file, kept)
             failures.append(f"{name}: file {index} ended the process (exit code {child.returncode}), kept as {kept}\n{end}")

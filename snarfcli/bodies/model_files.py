@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from snarfcli.bodies.body import Body
-from snarfcli.bodies.skeleton import SMPL_JOINT_NAMES, SMPLH_JOINT_NAMES, SMPLX_JOINT_NAMES
+from snarfcli.bodies.skeleton import MAX_JOINTS, SMPL_JOINT_NAMES, SMPLH_JOINT_NAMES, SMPLX_JOINT_NAMES
 from snarfcli.errors import UserError
 from snarfcli.files import read_npz
 from snarfcli.formats.pickles import read_pickle
@@ -25,7 +25,6 @@ log = logging.getLogger(__name__)
 _REQUIRED_KEYS = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs")
 _KEYS = (*_REQUIRED_KEYS, "posedirs", "joint_names")
 _JOINT_NAMES = {len(names): names for names in (SMPL_JOINT_NAMES, SMPLH_JOINT_NAMES, SMPLX_JOINT_NAMES)}
-_MAX_JOINTS = 1000
 _MAX_SHAPES = 300  # of SMPL v1.1.0 and SMPL-X
 # Components of SMPL-X files: first shape, then expression; smplx 0.1.28 cuts them at the same places.
 _SHAPES_OF_SMPLX = {20: 10, 400: 300}
@@ -127,8 +126,8 @@ def _check_shapes(arrays: dict[str, Any], path: Path) -> tuple[int, int]:
         if tuple(arrays[key].shape) != shape:
             got, expected = (str(list(s)).replace("'", "") for s in (arrays[key].shape, shape))
             raise UserError(f"body {path}: {key}: wanted shape {expected}, got {got}; get another copy")
-    if not vertices[0] or not 0 < joints[0] <= _MAX_JOINTS:
-        wanted_counts = f"at least 1 vertex and 1 to {_MAX_JOINTS:,} joints"
+    if not vertices[0] or not 0 < joints[0] <= MAX_JOINTS:
+        wanted_counts = f"at least 1 vertex and 1 to {MAX_JOINTS:,} joints"
         raise UserError(f"body {path}: wanted {wanted_counts}, got {vertices[0]} and {joints[0]}; get another copy")
     if scipy.sparse.issparse(arrays["J_regressor"]):
         arrays["J_regressor"] = arrays["J_regressor"].toarray()

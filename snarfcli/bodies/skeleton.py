@@ -7,12 +7,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from snarfcli.bodies.kinematics import forward_kinematics, invert_rigid
 
-__all__ = ["CANONICAL_HIP_RAD", "SMPLH_JOINT_NAMES", "SMPLX_JOINT_NAMES", "SMPL_JOINT_NAMES", "Skeleton", "legs_apart_pose"]
+__all__ = [
+    "CANONICAL_HIP_RAD",
+    "MAX_JOINTS",
+    "SMPLH_JOINT_NAMES",
+    "SMPLX_JOINT_NAMES",
+    "SMPL_JOINT_NAMES",
+    "Skeleton",
+    "legs_apart_pose",
+]
 
 SMPL_JOINT_NAMES = (
     "pelvis", "l_hip", "r_hip", "spine1", "l_knee", "r_knee", "spine2", "l_ankle", "r_ankle", "spine3",
@@ -34,6 +43,10 @@ _SIDES = {"l": "r", "L": "R", "left": "right", "Left": "Right", "LEFT": "RIGHT"}
 _SIDES |= {right: left for left, right in _SIDES.items()}
 # A word of its own, a letter before a capital, or left and right in a word: l_hip, hip.L, Ear_R_tip, lThigh, LeftArm, hand_left
 _SIDE = re.compile("^[lr](?=[A-Z])|(?<![A-Za-z])[lLrR](?![A-Za-z])|left|right|Left|Right|LEFT|RIGHT")
+
+MAX_JOINTS = 1000
+"""Maximum number of joints in a file: SMPL-X has 55, a character with fingers and face about 200."""
+_FARTHEST_M = 1e5
 
 CANONICAL_HIP_RAD = torch.pi / 6
 """Outward rotation of each leg in the canonical pose (SNARF's released code: 30 degrees)."""
@@ -135,11 +148,29 @@ class Skeleton:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Skeleton:
-        """Return the skeleton of a dictionary from `to_dict`; arrays and lists are accepted in place of tensors."""
+        """Return the skeleton of a dictionary from `to_dict`; arrays and lists are accepted in place of tensors.
+
+        Raises:
+            KeyError, ValueError: the content, which may be from any file, does not describe a skeleton.
+        """
+        names, parents = list(content["names"]), list(content["parents"])
+        idle = list(content.get("idle", ()))  # files of before have none
+        if not 0 < len(parents) <= MAX_JOINTS:
+            raise ValueError(f"skeleton.parents: wanted 1 to {MAX_JOINTS} joints, got {len(parents)}")
+        if not all(isinstance(name, str) for name in names):
+            raise ValueError("skeleton.names: wanted texts, got other values")
+        if not all(isinstance(joint, (int, np.integer)) and not isinstance(joint, bool) for joint in (*parents, *idle)):
+            raise ValueError("skeleton.parents, skeleton.idle: wanted whole numbers, got other values")
+        if not all(-1 <= int(parent) < joint for joint, parent in enumerate(parents)):
+            raise ValueError("skeleton.parents: wanted -1 for a root, and parents before their children, got other numbers")
+        places = [torch.as_tensor(content[name]) for name in ("joints_rest", "canonical_pose")]
+        for name, values in zip(("joints_rest", "canonical_pose"), places, strict=True):
+            if not values.is_floating_point() or not bool((values.abs() < _FARTHEST_M).all()):
+                raise ValueError(f"skeleton.{name}: wanted finite numbers below {_FARTHEST_M:g}, got others")
         return cls(
-            names=tuple(str(name) for name in content["names"]),
-            parents=tuple(int(parent) for parent in content["parents"]),
-            joints_rest=torch.as_tensor(content["joints_rest"]),
-            canonical_pose=torch.as_tensor(content["canonical_pose"]),
-            idle=tuple(int(joint) for joint in content.get("idle", ())),  # files of before have none
+            names=tuple(str(name) for name in names),
+            parents=tuple(int(parent) for parent in parents),
+            joints_rest=places[0],
+            canonical_pose=places[1],
+            idle=tuple(int(joint) for joint in idle),
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -22,8 +21,6 @@ from snarfcli.hydra_config.schema import config_folder, list_settings, preset_gr
 from snarfcli.interrupts import exit_code, signals_as_interrupts
 
 __all__ = ["COMMANDS", "Command", "main"]
-
-log = logging.getLogger(__name__)
 
 EXIT_USER_ERROR = 2
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import re
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.texts import one_line
 
 __all__ = ["user_message"]
@@ -34,9 +34,14 @@ def _message(error: BaseException) -> str | None:
     for link in chain:
         if isinstance(link, OSError) and not isinstance(link, (ConnectionError, ChildProcessError)):
             return _file_message(link)
+        if is_out_of_memory(link):
+            return _memory_message(link)
     if isinstance(error, OmegaConfBaseException | HydraException):
         return _config_message(chain)
     return None
+
+
+_NO_PERMISSION = "no permission; change its permissions, or name another place (output_root=... or data_root=...)"
 
 
 def _chain(error: BaseException) -> list[BaseException]:
@@ -55,8 +60,13 @@ def _file_message(error: OSError) -> str:
     advice = {
         errno.ENOSPC: "the disk is full; free some space, then run the command again: it continues where it stopped",
         errno.EDQUOT: "the disk quota is used up; free some space, then run the command again",
-        errno.EACCES: "no permission; choose another folder with output_root=... or data_root=...",
-        errno.EPERM: "no permission; choose another folder with output_root=... or data_root=...",
+        errno.EACCES: _NO_PERMISSION,
+        errno.EPERM: _NO_PERMISSION,
+        errno.EMFILE: "too many open files; raise the limit with `ulimit -n`",
+        errno.ENFILE: "too many open files on this machine; close other programs",
+        errno.ENOMEM: "not enough memory; close other programs",
+        errno.EIO: "the disk reports an error; the file itself may be whole; check the disk, or copy the folder to another one",
+        errno.ESTALE: "the network drive lost it; try again",
         errno.EROFS: "the file system is read-only; choose another folder with output_root=... or data_root=...",
         errno.ENOTDIR: "part of the path is a file, not a folder; choose another folder",
         errno.EISDIR: "is a folder, not a file",
@@ -64,6 +74,12 @@ def _file_message(error: OSError) -> str:
         errno.ENOENT: "does not exist and cannot be created; choose another folder or file",
     }
     return f"{name}: {advice.get(error.errno or 0, error.strerror or one_line(error))}"
+
+
+def _memory_message(error: BaseException) -> str:
+    """Return what needed too much memory, if it is known, and the next step."""
+    own = one_line(error, 300) if isinstance(error, MemoryError) and str(error) else ""
+    return own if ";" in own else "not enough memory; close other programs, or choose smaller sizes"
 
 
 def _config_message(chain: list[BaseException]) -> str:

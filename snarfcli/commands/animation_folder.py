@@ -9,10 +9,12 @@ from typing import Any
 from snarfcli import names
 from snarfcli.commands.animate_settings import AnimateConfig
 from snarfcli.commands.selection import SelectedMotion
+from snarfcli.descriptions import DescriptionError, check_plain
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, remove_temporaries, write_json
+from snarfcli.texts import one_line
 
-__all__ = ["POSTER", "RECORD", "VIDEO", "folder_name", "frame_settings", "prepare_folder"]
+__all__ = ["POSTER", "RECORD", "VIDEO", "check_record", "folder_name", "frame_settings", "prepare_folder"]
 
 RECORD = "animation.json"
 VIDEO = "video.mp4"
@@ -50,20 +52,7 @@ def prepare_folder(folder: Path, settings: dict[str, Any], overwrite: bool) -> N
     Raises:
         UserError: it has frames of other settings, or files of unknown origin, and `overwrite` is false.
     """
-    record = folder / RECORD
-    old = None
-    if record.exists() and not overwrite:
-        content = read_json(record, "record of an animation")
-        old = content.get("settings") if isinstance(content, dict) else None
-        if not isinstance(old, dict):
-            raise UserError(f"{record} is not the record of an animation; give overwrite=true to replace it, or output=FOLDER")
-    if old is not None:
-        changed = [name for name, value in settings.items() if old.get(name) != value]
-        if changed:
-            what = ", ".join(f"{name} {old.get(name)} (now {settings[name]})" for name in changed if "sha256" not in name)
-            what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
-            raise UserError(f"{folder} has frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
-    else:
+    if overwrite or not check_record(folder, settings):
         there = [*folder.glob("frame_*.ply"), *folder.glob("frame_*.obj"), *folder.glob(VIDEO), *folder.glob(POSTER)]
         if there and not overwrite:  # without a record their origin is unknown
             raise UserError(
@@ -72,4 +61,35 @@ def prepare_folder(folder: Path, settings: dict[str, Any], overwrite: bool) -> N
         for stale in there:
             stale.unlink(missing_ok=True)
     remove_temporaries(folder)
-    write_json(record, {"complete": False, "settings": settings})
+    write_json(folder / RECORD, {"complete": False, "settings": settings})
+
+
+def check_record(folder: Path, settings: dict[str, Any]) -> bool:
+    """Check that the frames in a folder were made with the same settings; return whether it has a record of any.
+
+    Raises:
+        UserError: they were made with other settings, or the record is damaged.
+    """
+    record = folder / RECORD
+    if not record.exists():
+        return False
+    content = read_json(record, "record of an animation")
+    old = content.get("settings") if isinstance(content, dict) else None
+    if not isinstance(old, dict) or not _is_plain(old):
+        raise UserError(f"{record} is not the record of an animation; give overwrite=true to replace it, or output=FOLDER")
+    changed = [name for name, value in settings.items() if old.get(name) != value]
+    if changed:
+        others = [name for name in changed if "sha256" not in name]
+        what = ", ".join(f"{name} {one_line(str(old.get(name)), 60)} (now {settings[name]})" for name in others)
+        what = what or ("another avatar" if "avatar_sha256" in changed else "another motion")
+        raise UserError(f"{folder} has frames made with {what}; give overwrite=true to replace them, or output=FOLDER")
+    return True
+
+
+def _is_plain(content: Any) -> bool:
+    """Return whether content is plain data."""
+    try:
+        check_plain(content, "settings")
+    except DescriptionError:
+        return False
+    return True

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from omegaconf import MISSING
 
@@ -154,6 +157,8 @@ def _evaluate(config: EvalConfig, avatar: Avatar, path: Path, store: SampleStore
     weights = measure_weights(avatar, store.template)
     if weights is not None:
         log.info("%s", weights_text(weights))
+    _check_finite("surfaces", surfaces)
+    _check_finite("weights", weights)
     (folder / "frames.png").unlink(missing_ok=True)  # an older figure does not belong to these numbers
     content = metrics_content(evaluation, {**asdict(config), "avatar": str(path)})
     write_json(folder / "metrics.json", {**content, "surfaces": surfaces, "weights": weights})
@@ -222,6 +227,17 @@ def _check_match(avatar: Avatar, store: SampleStore, config: EvalConfig) -> None
         if trained_on is not None and str(trained_on) not in (wanted, config.data.avatars):
             trained_on = one_line(str(trained_on), 60)
             log.warning("warning: this avatar was trained on %s %s and is evaluated on %s %s", name, trained_on, name, wanted)
+
+
+def _check_finite(name: str, results: Mapping[str, Any] | None) -> None:
+    """Check that no result is NaN or infinite, which JSON cannot express.
+
+    Raises:
+        UserError: one is.
+    """
+    for key, value in (results or {}).items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UserError(f"{name}.{key} is {value}, so nothing was written; the avatar or the samples are damaged")
 
 
 def _folder_name(config: EvalConfig, avatar: Avatar) -> str:

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.bodies.skeleton import MAX_JOINTS
 from snarfcli.datasets.named_values import NamedValues
 from snarfcli.motions.angles import angle_problem
 
@@ -35,7 +36,6 @@ DEFAULT_FRAME_RATE = 30.0
 """Frames per second of pose files without a frame rate."""
 
 _FULL_TURN = 2 * np.pi  # radians; no joint is turned further in one pose
-_MAX_JOINTS = 1000  # SMPL-X has 55, a character with fingers and face about 200; each needs weights at every point
 _ALIASES = {
     "names": ("names", "joint_names"),
     "parents": ("parents",),
@@ -106,8 +106,8 @@ def read_skeleton(path: str | Path) -> SkeletonFile:
         missing = "parents" if parents is None else "joints_rest"
         content.fail(f"has no {missing}; wanted names, parents and joints_rest, see data/README.md")
     parents = parents.tolist() if isinstance(parents, np.ndarray) and parents.ndim == 1 else parents
-    if not isinstance(parents, list) or not 0 < len(parents) <= _MAX_JOINTS:
-        content.fail(f"parents: wanted a list of 1 to {_MAX_JOINTS} joints, got another value; repair it")
+    if not isinstance(parents, list) or not 0 < len(parents) <= MAX_JOINTS:
+        content.fail(f"parents: wanted a list of 1 to {MAX_JOINTS} joints, got another value; repair it")
     count = len(parents)
     names = _names(content, count)
     numbers = [_parent(content, parent, names) for parent in parents]

@@ -10,6 +10,9 @@ from snarfcli.segments import distance_to_segments
 
 __all__ = ["cells_near", "corners_of"]
 
+_SEGMENTS_AT_ONCE = 256
+_NODES_AT_ONCE = 2**16
+
 
 def cells_near(grid: CanonicalGrid, shape: tuple[int, int, int], places: list[tuple[Tensor, float]]) -> Tensor:
     """Return whether cells have a corner near one of several places, [D-1, H-1, W-1], bool.
@@ -23,8 +26,9 @@ def cells_near(grid: CanonicalGrid, shape: tuple[int, int, int], places: list[tu
     nodes = grid.nodes(shape).reshape(-1, 3)
     near = torch.zeros(len(nodes), dtype=torch.bool, device=nodes.device)
     for segments, radius in places:
-        for some in segments.split(256):  # bounds the memory
-            near |= distance_to_segments(nodes, some) < radius
+        for some in segments.split(_SEGMENTS_AT_ONCE):  # both bound the memory
+            for part, part_near in zip(nodes.split(_NODES_AT_ONCE), near.split(_NODES_AT_ONCE), strict=True):
+                part_near |= distance_to_segments(part, some) < radius
     return torch.nn.functional.max_pool3d(near.reshape(1, 1, *shape).float(), 2, stride=1)[0, 0] > 0
 
 

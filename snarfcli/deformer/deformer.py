@@ -29,6 +29,8 @@ from snarfcli.deformer.weights import (
 
 __all__ = ["ForwardDeformer"]
 
+_VALUES_AT_ONCE = 2**24  # of a layer, at the nodes; 65,536 nodes with layers of 256
+
 
 class ForwardDeformer(nn.Module):
     """Find the canonical correspondences of posed points under learned forward skinning.
@@ -135,8 +137,12 @@ class ForwardDeformer(nn.Module):
             return self._checked(self.field.at_nodes(nodes), count)
         points = self.grid.nodes(self.shape).reshape(-1, 3) if nodes is None else self._active_points
         # not a subclass, whose `forward` may be another one
-        evaluate = self.field.at_fixed_points if type(self.field) is NetworkWeights else self.field
-        return self._checked(evaluate(points), count)
+        if type(self.field) is not NetworkWeights:
+            return self._checked(self.field(points), count)
+        most = count if torch.is_grad_enabled() else max(1, _VALUES_AT_ONCE // self.field.most_values)
+        if count <= most:
+            return self._checked(self.field.at_fixed_points(points), count)
+        return self._checked(torch.cat([self.field.at_fixed_points(part) for part in points.split(most)]), count)
 
     def node_weights(self, active_only: bool | None = None) -> NodeWeights | None:
         """Evaluate the skinning weights at the nodes that a search reads; None for a field that is searched directly.
@@ -307,6 +313,8 @@ def _make_field(
 def _after_load(deformer: ForwardDeformer, incompatible: object) -> None:
     """Update what follows from the state after load_state_dict: the field's box and the nodes of active cells."""
     deformer._frozen = None
+    if not bool(deformer.active_cells.any()):
+        raise ValueError("active_cells: wanted at least one cell, got none")
     deformer._update_active_nodes()
     if isinstance(deformer.field, WeightField):
         deformer.field.set_box(deformer.grid)

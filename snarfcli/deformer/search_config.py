@@ -10,6 +10,7 @@ __all__ = ["BACKENDS", "JACOBIANS", "SEARCHES", "SearchConfig", "as_search_confi
 
 SEARCHES = ("complete", "broyden")
 """Names of the searches."""
+_MOST_STEPS = 10_000  # the papers take at most 50
 JACOBIANS = ("exact", "broyden")
 """Inverse Jacobians at the roots of a broyden search."""
 
@@ -59,6 +60,8 @@ def check_search_config(search: SearchConfig, num_bones: int) -> None:
     for name in ("tolerance", "max_steps", "divergence"):
         if not getattr(search, name) > 0:
             raise ValueError(f"search.{name}: wanted more than 0, got {getattr(search, name)}")
+    if search.max_steps > _MOST_STEPS:
+        raise ValueError(f"search.max_steps: wanted at most {_MOST_STEPS}, got {search.max_steps}")
     if search.name == "complete" and search.jacobian == "broyden":
         raise ValueError("search.jacobian 'broyden' needs search.name 'broyden': a complete search has the exact Jacobian")
     bones = search.init_bones
@@ -70,3 +73,5 @@ def check_search_config(search: SearchConfig, num_bones: int) -> None:
         raise ValueError("search.init_bones: wanted at least one bone, got none; None starts from all bones")
     if not all(0 <= bone < num_bones for bone in bones):
         raise ValueError(f"search.init_bones: wanted bones from 0 to {num_bones - 1}, got {list(bones)}")
+    if len(set(bones)) < len(bones):
+        raise ValueError(f"search.init_bones: wanted each bone at most once, got {list(bones)}")

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -50,6 +51,7 @@ class NodeWeights:
 
 
 _FAR_M = 100.0  # distance of a bone that is nowhere
+_DISTANCES_AT_ONCE = 2**24  # those of 65,536 nodes to 256 segments
 
 
 class BonePrior(nn.Module):
@@ -75,10 +77,18 @@ class BonePrior(nn.Module):
 
     def forward(self, points: Tensor, segments: Tensor | None = None) -> Tensor:
         """Return logits [N, J] at points [N, 3], metres, of the canonical frame, or of the frame of `segments` [S, 2, 3]."""
-        distances = segment_distances(points, self.segments if segments is None else segments)
+        segments = self.segments if segments is None else segments
+        if len(points) * len(segments) > _DISTANCES_AT_ONCE:
+            return torch.cat([self(part, segments) for part in points.split(max(1, _DISTANCES_AT_ONCE // len(segments)))])
+        distances = segment_distances(points, segments)
         owner = self.owner.expand(len(points), -1)
         start = distances.new_full((len(points), self.num_bones), _FAR_M)
         return start.scatter_reduce(1, owner, distances, "amin") / -self.falloff
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *arguments: Any) -> None:
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
+        if not bool(((self.owner >= 0) & (self.owner < self.num_bones)).all()):
+            arguments[-1].append(f"{prefix}owner: wanted bones from 0 to {self.num_bones - 1}, got others")
 
 
 class NetworkWeights(WeightField):
@@ -135,6 +145,13 @@ class NetworkWeights(WeightField):
         for layer in self.layers[:-1]:
             h = nn.functional.softplus(layer(h), beta=_SHARPNESS_OF_SOFTPLUS)
         return self._weights(self.layers[-1](h), canonical)
+
+    @property
+    def most_values(self) -> int:
+        """Largest number of values per point of any layer, of the weights and of the prior."""
+        segments = 0 if self.prior is None else len(self.prior.segments)
+        widths = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
+        return max(*widths, self.softmax.num_bones, segments)
 
     def at_fixed_points(self, canonical: Tensor) -> Tensor:
         """Return the same as `forward`, several times faster on a CPU, for the same tensor of points in step after step.

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from snarfcli.errors import UserError
 from snarfcli.evaluation.metrics import FrameMetrics, in_box, iou
+from snarfcli.models.system import FieldSamples
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
 from snarfcli.samples.sequence import SequenceSamples
@@ -80,7 +81,7 @@ def evaluate(
         desc: label of the progress line.
 
     Raises:
-        UserError: a number is out of range, or there are no frames.
+        UserError: a number is out of range, there are no frames, or a value is NaN.
     """
     frames = choose_frames(sequences, max_frames)
     first, _ = frames[0]
@@ -131,7 +132,23 @@ def predict_inside(avatar: TrainedField, sequence: SequenceSamples, index: int, 
     """Return which points [N, 3] of one frame the avatar predicts to be inside, bool [N]."""
     transforms, pose = _posed(sequence, index)
     parts = torch.as_tensor(points).split(_POINTS_AT_ONCE)
-    return np.concatenate([(avatar.query(part[None], transforms, pose).logits[0] > 0).cpu().numpy() for part in parts])
+    values = (avatar.query(part[None], transforms, pose) for part in parts)
+    return np.concatenate([_occupied(some, sequence, index).cpu().numpy() for some in values])
+
+
+def _occupied(values: FieldSamples, sequence: SequenceSamples, index: int) -> Tensor:
+    """Return which points [N] of one frame are inside.
+
+    Raises:
+        UserError: a value is NaN, which is neither inside nor outside.
+    """
+    logits = values.logits[0]
+    if bool(logits.isnan().any()):
+        raise UserError(
+            f"{sequence.name}, frame {sequence.frame_numbers[index]}: the avatar's occupancy is NaN at "
+            f"{int(logits.isnan().sum())} of {len(logits)} points; train it again"
+        )
+    return logits > 0
 
 
 def _posed(sequence: SequenceSamples, index: int) -> tuple[Tensor, Tensor]:
@@ -151,7 +168,7 @@ def _query(
         searched = _time_s(avatar.device)
         values = avatar.shape_at(found, pose)
         evaluated = _time_s(avatar.device)
-        inside.append((values.logits[0] > 0).cpu().numpy())
+        inside.append(_occupied(values, sequence, index).cpu().numpy())
         counts.append(values.counts[0].cpu().numpy())
         search_s += searched - start
         shape_s += evaluated - searched

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from snarfcli.evaluation.evaluate import choose_frames
+from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.surfaces import field_surface
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
@@ -63,7 +64,7 @@ def measure_surfaces(avatar: TrainedField, sequences: Sequence[SequenceSamples],
         )
         try:
             predicted = field_surface(avatar, pose, translation, resolution, transforms=transforms)
-        except ValueError as error:
+        except (EmptySurface, FullSurface) as error:
             log.warning("warning: %s, frame %d: %s", sequence.name, sequence.frame_numbers[index], error)
             continue
         truth = sequence.vertices(index), sequence.faces(index)

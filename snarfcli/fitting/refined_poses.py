@@ -16,6 +16,7 @@ from snarfcli.errors import UserError
 from snarfcli.files import write_arrays
 from snarfcli.fitting.corrections import Corrections, Corrector, bone_turns
 from snarfcli.fitting.pose_fit import CanonicalPoints, FittedPoses, PoseFit, Surfaces
+from snarfcli.models.file_tensors import read_tensor
 from snarfcli.samples.sequence import Frame, SequenceSamples
 from snarfcli.sampling import oriented_surface_samples
 
@@ -251,11 +252,12 @@ class RefinedPoses:
         """Continue from `state`.
 
         Raises:
-            KeyError, RuntimeError, TypeError, ValueError: the state does not fit the sequences.
+            KeyError, TypeError, ValueError, AttributeError: the state does not fit the sequences.
         """
         for name, mine in self._values().items():
-            if state[name].shape != mine.shape:
-                raise ValueError(f"wanted corrections {list(mine.shape)}, got {list(state[name].shape)}")
+            # the distance of a frame is NaN before it is refined, and infinite where nothing matches
+            theirs = state[name].nan_to_num(posinf=0.0) if name == "distance" else state[name]
+            read_tensor(theirs, f"poses.{name}", mine.shape)
             mine.copy_(state[name])
         done = (~self.distance_m.isnan()).nonzero()[:, 0]
         if len(done):

@@ -14,6 +14,7 @@ from snarfcli.fitting.refined_poses import RefinedPoses
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.surfaces import canonical_surface
 from snarfcli.models.fast_snarf import FastSnarf
+from snarfcli.models.file_tensors import read_tensor
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
 from snarfcli.samples.sequence import Frame, SequenceSamples
@@ -136,8 +137,13 @@ class PoseRefiner:
         """Continue from `state`.
 
         Raises:
-            KeyError, RuntimeError, TypeError, ValueError: the state does not fit the sequences.
+            KeyError, TypeError, ValueError, AttributeError: the state does not fit the sequences.
         """
         self.poses.restore(state)
         points = state["points"]
-        self._points = None if points is None else CanonicalPoints(**{k: v.to(self.poses.device) for k, v in points.items()})
+        if points is not None:
+            columns = {"points": 3, "normals": 3, "weights": self.poses.skeleton.num_joints}
+            count = len(points["points"])
+            read = {name: read_tensor(points[name], name, (count, width)) for name, width in columns.items()}
+            points = CanonicalPoints(**{name: value.to(self.poses.device) for name, value in read.items()})
+        self._points = points

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from snarfcli.formats.pickle_tree import Call, Name, PickleError, Unknown, shown
 from snarfcli.formats.pickle_values import KNOWN_NAMES, Reading, odd
 
-__all__ = ["ESTIMATE_NAMES", "EstimateReading", "value_size"]
+__all__ = ["ESTIMATE_NAMES", "PLAIN_NAMES", "EstimateReading", "PlainReading", "value_size"]
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +41,14 @@ ESTIMATE_NAMES = {
     **{("__builtin__", name): "plain type" for name in ("dict", "list", "int", "float", "str", "tuple")},
 }
 """Kind of each (module, name) that the results of a video estimator may contain, for `read_tree`."""
+
+PLAIN_NAMES = {
+    ("", "stored"): "stored",
+    ("torch._utils", "_rebuild_tensor_v2"): "tensor",
+    **{("torch", name): "storage type" for name in _STORAGES if name != "BFloat16Storage"},
+    ("collections", "OrderedDict"): "dict",
+}
+"""Kind of each (module, name) that a file of plain data and tensors may contain, for `read_tree`."""
 
 
 def value_size(kind: Any) -> int:
@@ -200,3 +208,18 @@ EstimateReading.makers = {
     "array in file": EstimateReading.make_array_in_file,
     "default dict": EstimateReading.make_default_dict,
 }
+
+
+class PlainReading(EstimateReading):
+    """Conversion of the tree of a file that holds plain data and tensors only; tensors of bool become arrays of bool."""
+
+    def make_stored(self, name: Name, args: tuple, state: Any, call: Call, depth: int) -> NDArray:
+        values = super().make_stored(name, args, state, call, depth)
+        kind = args[0][1]
+        if not isinstance(kind, Name) or not kind.path.endswith(".BoolStorage"):
+            return values
+        self.spend(values.nbytes)
+        return values != 0  # not a view: PyTorch's kernels assume that the bytes of bool are 0 and 1
+
+
+PlainReading.makers = {kind: EstimateReading.makers[kind] for kind in ("dict", "tensor")} | {"stored": PlainReading.make_stored}

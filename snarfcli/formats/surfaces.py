@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, raise_system_error
 from snarfcli.formats.gltf import read_gltf_surface
 from snarfcli.formats.off import parse_off
 from snarfcli.formats.plain_meshes import MAX_FACES, parse_obj, parse_stl
@@ -86,6 +86,7 @@ def read_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int6
             with np.errstate(invalid="ignore"):  # NaN is rejected below
                 vertices, faces = _PARSERS[suffix](content)
         except (ValueError, OverflowError, MemoryError) as error:
+            raise_system_error(error, path)
             raise UserError(f"mesh {path} cannot be read ({one_line(error, 200)}); copy it again or export it again") from None
     if not len(faces):
         raise UserError(f"mesh {path} has no triangles (a point cloud is not a surface); give a mesh with faces")

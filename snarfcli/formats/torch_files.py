@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import struct
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from snarfcli.errors import UserError
+from snarfcli.errors import UserError, raise_system_error
 from snarfcli.formats.pickle_opcodes import read_tree, read_tree_at
-from snarfcli.formats.pickle_tensors import ESTIMATE_NAMES, EstimateReading, value_size
+from snarfcli.formats.pickle_tensors import ESTIMATE_NAMES, PLAIN_NAMES, EstimateReading, PlainReading, value_size
 from snarfcli.formats.pickle_tree import Call, PickleError, shown, text_of
 from snarfcli.texts import one_line
 
-__all__ = ["read_torch", "storage_of"]
+__all__ = ["read_plain_torch", "read_torch", "storage_of"]
 
 _MAX_FILE_BYTES = 1 << 28
 # The magic number and the version of the old format, two pickles.
@@ -40,7 +42,42 @@ def read_torch(path: str | Path, what: str = "file") -> Any:
 
     Raises:
         UserError: the file is missing, of another format, damaged or too large.
+        OSError, MemoryError: the system cannot read it.
     """
+    path = _checked(path, what)
+    with _told(path, what):
+        if path.stat().st_size > _MAX_FILE_BYTES:
+            raise UserError(f"{what} {path} is larger than {_MAX_FILE_BYTES >> 20} MiB; save the poses alone")
+        with path.open("rb") as file:
+            if file.read(len(_OLD)) == _OLD:
+                return _old_content(path.read_bytes(), path)
+            with _opened(file) as archive:
+                return _Archive(archive, path.stat().st_size).content(path)
+
+
+def read_plain_torch(path: str | Path, what: str = "file") -> Any:
+    """Read a file of `torch.save` that holds nothing but plain data and dense tensors, in the zip format.
+
+    The result is as large as the file: members are not compressed, and each tensor is made of bytes that the file holds.
+
+    Args:
+        path: the file.
+        what: name of the kind of file, for messages.
+
+    Returns:
+        dict, list, tuple, str, bytes, numbers, None, and a NumPy array per tensor, of the tensor's type, which owns its memory.
+
+    Raises:
+        UserError: the file is missing, of another format or damaged, or names any other class or function.
+        OSError, MemoryError: the system cannot read it.
+    """
+    path = _checked(path, what)
+    with _told(path, what), path.open("rb") as file, _opened(file) as archive:
+        return _Archive(archive, path.stat().st_size).plain_content()
+
+
+def _checked(path: str | Path, what: str) -> Path:
+    """Return the path of a regular file; a pipe would block."""
     path = Path(path)
     if path.is_dir():
         raise UserError(f"{what} {path} is a folder; name a file of PyTorch (.pt)")
@@ -48,25 +85,27 @@ def read_torch(path: str | Path, what: str = "file") -> Any:
         raise UserError(f"no {what} at {path}")
     if not path.is_file():
         raise UserError(f"{what} {path} is not a regular file; name a file of PyTorch (.pt)")
+    return path
+
+
+@contextmanager
+def _told(path: Path, what: str) -> Iterator[None]:
+    """Turn the errors of reading a damaged file into UserErrors that name it."""
     try:
-        if path.stat().st_size > _MAX_FILE_BYTES:
-            raise UserError(f"{what} {path} is larger than {_MAX_FILE_BYTES >> 20} MiB; save the poses alone")
-        with path.open("rb") as file:
-            if file.read(len(_OLD)) == _OLD:
-                return _old_content(path.read_bytes(), path)
-            if not zipfile.is_zipfile(file):
-                raise PickleError("is not a file of PyTorch, or is cut off; copy or download it again")
-            with zipfile.ZipFile(file) as archive:
-                return _Archive(archive, path.stat().st_size).content(path)
+        yield
     except UserError:
         raise
     except PickleError as error:
         raise UserError(f"{what} {path} {error}") from None
-    except MemoryError:
-        raise UserError(f"{what} {path} needs more memory than is available; close other programs") from None
     except Exception as error:  # zipfile raises many kinds
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise UserError(f"{what} {path} is damaged ({one_line(reason, 200)}); copy or download it again") from None
+        raise_system_error(error, path)
+        raise UserError(f"{what} {path} is damaged ({one_line(error, 200)}); copy or download it again") from None
+
+
+def _opened(file: IO[bytes]) -> zipfile.ZipFile:
+    if not zipfile.is_zipfile(file):
+        raise PickleError("is not a file of PyTorch, or is cut off; copy or download it again")
+    return zipfile.ZipFile(file)
 
 
 def storage_of(data: bytes, budget: int) -> Any:
@@ -141,16 +180,28 @@ class _Archive:
         self.storages: dict[str, memoryview] = {}
 
     def content(self, path: Path) -> Any:
+        """Return the content of any file, with `Unknown` for objects of unknown classes, which are logged."""
+        order = self.find()
+        tree = read_tree(self.member("data.pkl"), ESTIMATE_NAMES)
+        reading = EstimateReading(_budget(self.size), self.storage, order=order)
+        content = reading.value(tree, 0)
+        reading.report(path)
+        return content
+
+    def plain_content(self) -> Any:
+        """Return the content of a file of plain data and tensors."""
+        order = self.find()
+        tree = read_tree(self.member("data.pkl"), PLAIN_NAMES)
+        return PlainReading(_budget(self.size), self.storage, order=order).value(tree, 0)
+
+    def find(self) -> str:
+        """Find the folder of the content inside the archive, and return the byte order of the storages, `<` or `>`."""
         name = next((name for name in self.members if name.endswith("/data.pkl")), None)
         if name is None:
             raise PickleError("has no data.pkl, as files of torch.save have; give another file")
         self.folder = name.removesuffix("data.pkl")
         order = self.member("byteorder") if f"{self.folder}byteorder" in self.members else b"little"
-        tree = read_tree(self.member("data.pkl"), ESTIMATE_NAMES)
-        reading = EstimateReading(_budget(self.size), self.storage, order=">" if order.strip() == b"big" else "<")
-        content = reading.value(tree, 0)
-        reading.report(path)
-        return content
+        return ">" if order.strip() == b"big" else "<"
 
     def storage(self, key: str) -> memoryview:
         if key not in self.storages:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from snarfcli.errors import UserError
 from snarfcli.meshing.lattice import Lattice, any_corner, first_lattice, grow, mixed_cells, nodes_of_cells
 from snarfcli.meshing.marching import MARGIN, Crossings, march
 from snarfcli.meshing.mesh import ExtractionStats, Mesh, keep_components
@@ -80,7 +81,8 @@ def extract_surface(
     Raises:
         EmptySurface: no evaluated point is occupied.
         FullSurface: all evaluated points are occupied.
-        ValueError: an argument is out of range, or the field returns NaN or a wrong shape.
+        ValueError: an argument is out of range, or the field returns a wrong shape.
+        UserError: the field returns NaN.
     """
     start = time.perf_counter()
     if coarse is None:
@@ -282,7 +284,7 @@ class _Evaluator:
                 raise ValueError(f"field: wanted shape [{len(points)}], one value per point, got {list(result.shape)}")
             result_np = result.detach().to("cpu", torch.float32).numpy() - np.float32(self.level)
             if np.isnan(result_np).any():
-                raise ValueError(f"field: wanted numbers, got NaN at {np.isnan(result_np).sum()} of {len(points)} points")
+                raise UserError(f"field: wanted numbers, got NaN at {np.isnan(result_np).sum()} of {len(points)} points")
             out[part] = np.clip(result_np, -largest, largest)
             self.points += len(points)
             self.calls += 1

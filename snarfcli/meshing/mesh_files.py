@@ -5,15 +5,20 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path
+from snarfcli.formats.plain_meshes import parse_obj, text_lines
+from snarfcli.formats.ply import parse_ply
+from snarfcli.formats.ply_header import read_ply_header
 from snarfcli.meshing.mesh import Mesh
+from snarfcli.texts import one_line
 
 __all__ = ["MESH_WRITERS", "read_mesh", "write_mesh", "write_obj", "write_ply"]
+
+_MAX_BYTES = 2**28
 
 
 def write_ply(path: str | Path, mesh: Mesh) -> None:
@@ -79,20 +84,57 @@ def write_mesh(path: str | Path, mesh: Mesh) -> None:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh with its colours; vertices are neither merged nor reordered.
+    """Read a mesh in one of the formats of `write_mesh` with its colours; vertices are neither merged nor reordered.
+
+    `formats.surfaces.read_surface` reads more formats.
 
     Raises:
-        UserError: the file is missing or is not a mesh.
+        UserError: the file is missing, of another format, too large or damaged.
+        OSError, MemoryError: the system cannot read it.
     """
-    import trimesh  # here: loading it takes a second, and writing does not need it
-
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise UserError(f"no mesh at {path}")
+    suffix = path.suffix.lower().lstrip(".")
+    if suffix not in _READERS or not path.is_file():
+        raise UserError(f"mesh {path}: wanted a file ending in {' or '.join(f'.{known}' for known in _READERS)}")
+    if path.stat().st_size > _MAX_BYTES:
+        raise UserError(f"mesh {path} is larger than {_MAX_BYTES >> 20} MiB; extract it at a lower resolution")
+    content = path.read_bytes()
     try:
-        loaded = trimesh.load_mesh(path, process=False, maintain_order=True)
-        visual: Any = loaded.visual  # its attributes depend on its kind
-        colors = visual.vertex_colors[:, :3] if visual.kind == "vertex" else None
-        return Mesh(loaded.vertices, loaded.faces, colors=colors)
-    except (ValueError, KeyError, IndexError, AttributeError, NotImplementedError) as error:
-        raise UserError(f"mesh {path} cannot be read ({error}); make it again") from None
+        with np.errstate(all="ignore"):  # infinite and NaN are rejected below
+            mesh = _READERS[suffix](content)
+        if not np.isfinite(mesh.vertices).all():
+            raise ValueError("it has NaN or infinity among its vertices")
+    except (ValueError, OverflowError) as error:
+        raise UserError(f"mesh {path} cannot be read ({one_line(error, 200)}); make it again") from None
+    return mesh
+
+
+def _read_ply(content: bytes) -> Mesh:
+    """Return the mesh in a PLY file, with colours from its table of vertices; ValueError if it is damaged."""
+    vertices, faces = parse_ply(content)
+    header, colors = read_ply_header(content), None
+    first = header.elements[0] if header.elements else None
+    if header.order and first is not None and first.name == "vertex" and not first.has_lists:
+        names = [one.name for one in first.properties]
+        dtype = np.dtype([(str(number), header.order + one.code) for number, one in enumerate(first.properties)])
+        columns = [names.index(name) for name in ("red", "green", "blue") if name in names]
+        if len(columns) == 3 and all(first.properties[column].code == "B" for column in columns):
+            table = np.frombuffer(content, dtype, first.count, header.starts[0])
+            colors = np.stack([table[str(column)] for column in columns], 1)
+    return Mesh(vertices, faces, colors=colors)
+
+
+def _read_obj(content: bytes) -> Mesh:
+    """Return the mesh in an OBJ file, with colours that follow the coordinates; ValueError if it is damaged."""
+    vertices, faces = parse_obj(content)
+    texts = [words[4:7] for words in text_lines(content) if words[0] == b"v" and len(words) == 7]
+    colors = None
+    if vertices.size and len(texts) == len(vertices):
+        shares = np.array([[float(word) for word in words] for words in texts])
+        colors = np.rint(255 * np.clip(np.nan_to_num(shares), 0, 1)).astype(np.uint8)
+    return Mesh(vertices, faces, colors=colors)
+
+
+_READERS: dict[str, Callable[[bytes], Mesh]] = {"ply": _read_ply, "obj": _read_obj}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -23,6 +24,7 @@ from snarfcli.shape import OccupancyNetwork
 
 __all__ = ["FastSnarf", "FoundRoots", "blend"]
 
+_MOST_SAMPLES = 2**26
 _SAMPLES_M = 0.04  # largest distance between the samples of a cell; a wrist is 5 cm thick
 _KEPT_RADIUS_M = 0.1  # cells with a corner at most this far from a bone are always searched
 _GROWTH_M = 0.06  # margin of the cells searched in training around what might be occupied
@@ -76,10 +78,11 @@ class FastSnarf(System):
         super().__init__(config, skeleton)
         if config.model.blend not in ("logit", "probability"):
             raise ValueError(f"model.blend: wanted logit or probability, got {config.model.blend!r}")
+        width, height, depth = config.skinning.resolution
+        _parts_of_cells(grid, (depth, height, width))
         skinning, bones, num_bones = config.skinning, bone_segments(skeleton), skeleton.num_joints
         active = kept = prior = None
         if skinning.bone_radius_m is not None:
-            width, height, depth = skinning.resolution
             points = surface[:, None].expand(-1, 2, -1)
             places = [(bones, skinning.bone_radius_m), (points, skinning.surface_radius_m)]
             active = cells_near(grid, (depth, height, width), places)
@@ -185,7 +188,7 @@ class FastSnarf(System):
         """
         deformer = self.deformer
         weights = deformer.node_weights(active_only=True)
-        finer = (deformer.grid.cell_size(deformer.shape) / _SAMPLES_M).ceil().long().tolist()[::-1]
+        finer = _parts_of_cells(deformer.grid, deformer.shape)
         fine = deformer.active_cells
         for axis, factor in enumerate(finer):
             fine = fine.repeat_interleave(factor, axis)
@@ -361,6 +364,22 @@ class FastSnarf(System):
             touched = self.occupied_cells(self._canonical_pose[None], reach_m=_SURFACE_MOVES_M)
             self._body_cells = touched if bool(touched.any()) else self.deformer.active_cells
         return self.deformer.posed_box(bone_transforms, self._body_cells)
+
+
+def _parts_of_cells(grid: CanonicalGrid, shape: tuple[int, int, int]) -> list[int]:
+    """Return into how many parts samples divide the sides of a cell, along z, y and x, for nodes `shape` = (D, H, W).
+
+    Raises:
+        ValueError: there are too many samples.
+    """
+    parts = [math.ceil(side / _SAMPLES_M) for side in grid.cell_size(shape).tolist()[::-1]]
+    samples = math.prod(part * (nodes - 1) for part, nodes in zip(parts, shape, strict=True))
+    if samples > _MOST_SAMPLES:
+        raise ValueError(
+            f"grid: wanted a canonical box of at most {_MOST_SAMPLES:,} cells of 4 cm, got one that is "
+            f"{grid.longest_side:.3g} m long; units are metres"
+        )
+    return parts
 
 
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:

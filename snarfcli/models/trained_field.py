@@ -10,25 +10,28 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from torch import Tensor
 from typing_extensions import Self
 
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import CanonicalGrid, PresetWeights
-from snarfcli.errors import UserError
+from snarfcli.deformer.search_config import check_search_config
+from snarfcli.descriptions import check_plain, read_described
+from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.files import write_tensors
 from snarfcli.models.back_d import BackD
 from snarfcli.models.back_lbs import BackLBS
 from snarfcli.models.checkpoint import load_checkpoint
+from snarfcli.models.described_sizes import check_described_sizes
 from snarfcli.models.fast_snarf import FastSnarf
+from snarfcli.models.file_tensors import FARTHEST_M, load_state, read_state, read_tensor
 from snarfcli.models.in_parts import points_in_parts, queries_in_parts
 from snarfcli.models.nasa import Nasa
 from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.smpl_nn import SmplNN
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
+from snarfcli.texts import one_line
 
 __all__ = ["SYSTEMS", "TrainedField"]
 
@@ -46,8 +49,7 @@ SYSTEMS: dict[str, type[System]] = {
 }
 """The systems by name, see `ModelConfig.name`."""
 
-_WRONG_CONTENT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError, MemoryError)
-_WRONG_CONTENT += (OmegaConfBaseException,)  # what a damaged description raises
+_WRONG_CONTENT = (LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError)
 
 T = TypeVar("T")
 
@@ -127,21 +129,42 @@ class TrainedField:
             UserError: the content does not describe an avatar.
         """
         try:
-            merged = OmegaConf.merge(OmegaConf.structured(AvatarConfig), content["config"])
-            config = cast("AvatarConfig", OmegaConf.to_object(merged))
-            grid = CanonicalGrid(content["grid"]["lower"], content["grid"]["upper"])
-            skeleton = Skeleton.from_dict(content["skeleton"])
-            template = _read_template(content.get("template"), config.model.name, skeleton.num_joints)
-            field = None
-            if config.skinning.name == "preset" and config.model.name == "fast_snarf":
-                width, height, depth = config.skinning.resolution
-                field = PresetWeights.placeholder(grid, (depth, height, width), skeleton.num_joints)
-            avatar = cls(config, skeleton, grid, facts=content["facts"], field=field, template=template)
-            avatar.model.load_state_dict(content["state"])
+            avatar = cls._built(content)
         except _WRONG_CONTENT as error:
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+            if is_out_of_memory(error):
+                raise MemoryError(f"not enough memory to load {path}; close other programs") from None
+            reason = f"no {error}" if isinstance(error, KeyError) else one_line(error, 300)
             raise UserError(f"{path} does not describe an avatar of this version ({reason}); train it again") from None
         avatar.model.eval()
+        return avatar
+
+    @classmethod
+    def _built(cls, content: dict[str, Any]) -> Self:
+        """Return the avatar of a description, which may be from any file: it is checked before anything is built.
+
+        Raises:
+            LookupError, TypeError, ValueError, RuntimeError, AttributeError, ArithmeticError: it does not describe an avatar.
+        """
+        config = read_described(AvatarConfig, content["config"], "config")
+        if config.model.name not in SYSTEMS:
+            raise ValueError(f"model.name: wanted one of {', '.join(SYSTEMS)}, got {config.model.name!r:.60}")
+        check_plain(content["facts"], "facts", finite=False)
+        skeleton = Skeleton.from_dict(content["skeleton"])
+        lower, upper = (
+            read_tensor(content["grid"][name], f"grid.{name}", (3,), below=FARTHEST_M) for name in ("lower", "upper")
+        )
+        grid = CanonicalGrid(lower, upper)
+        template = _read_template(content.get("template"), config.model.name, skeleton.num_joints)
+        state = read_state(content["state"])
+        check_described_sizes(config, skeleton.num_joints, grid, state)
+        field = None
+        if config.skinning.name == "preset" and config.model.name == "fast_snarf":
+            width, height, depth = config.skinning.resolution
+            field = PresetWeights.placeholder(grid, (depth, height, width), skeleton.num_joints)
+        avatar = cls(config, skeleton, grid, facts=dict(content["facts"]), field=field, template=template)
+        if avatar.model.search is not None:
+            check_search_config(avatar.model.search, skeleton.num_joints)
+        load_state(avatar.model, state)
         return avatar
 
     def to(self, device: str | torch.device) -> Self:
@@ -290,14 +313,9 @@ def _read_template(content: Any, model: str, num_joints: int) -> MeshTemplate | 
     if not isinstance(content, dict):
         raise ValueError(f"model {model} needs a template, got {type(content).__name__}")
     for name, columns in (("vertices", 3), ("weights", num_joints)):
-        part = content[name]
-        if not isinstance(part, Tensor) or part.ndim != 2 or part.shape[1] != columns or not len(part):
-            came = list(part.shape) if isinstance(part, Tensor) else type(part).__name__
-            raise ValueError(f"template.{name}: wanted shape [V, {columns}], got {came}")
-        if part.dtype != torch.float32 or not bool(part.isfinite().all()):
-            raise ValueError(f"template.{name}: wanted finite numbers of dtype torch.float32")
+        read_tensor(content[name], f"template.{name}", (None, columns), below=FARTHEST_M)
     vertices, weights = (content[name].numpy() for name in ("vertices", "weights"))
     template = MeshTemplate(vertices, np.zeros((0, 3), np.int32), weights)
-    if len(template.vertices) != len(template.weights):
+    if not len(template.vertices) or len(template.vertices) != len(template.weights):
         raise ValueError(f"template: {len(template.vertices)} vertices, but weights for {len(template.weights)}")
     return template

@@ -17,7 +17,7 @@ from snarfcli.avatar import Avatar
 from snarfcli.errors import UserError
 from snarfcli.evaluation.evaluate import choose_frames
 from snarfcli.evaluation.report import STORE_SPLITS
-from snarfcli.files import atomic_path, read_json
+from snarfcli.files import atomic_path
 from snarfcli.meshing.colors import weights_to_colors
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.surfaces import canonical_surface, field_surface
@@ -25,10 +25,11 @@ from snarfcli.progress import progress
 from snarfcli.rendering import Camera, contact_sheet, render, write_png
 from snarfcli.reproduce.experiments import Row
 from snarfcli.reproduce.plans import Plan
-from snarfcli.reproduce.results import COLUMNS, Result, summarise
+from snarfcli.reproduce.results import COLUMNS, Result, look_up, read_metrics, summarise
 from snarfcli.reproduce.stick2d_figures import draw_curves, draw_shapes, extreme_poses
 from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.samples.store import SampleStore
+from snarfcli.texts import one_line
 
 __all__ = ["draw_sequences", "draw_stick_curves", "draw_stick_shapes", "draw_systems", "draw_weights"]
 
@@ -134,8 +135,10 @@ def draw_sequences(plan: Plan, results: Sequence[Result], folder: Path) -> tuple
             continue
         by_name: dict[str, list[float]] = {}
         for result in of_row:
-            for name, sequence in read_json(result.files["ood"], "metrics").get("sequences", {}).items():
-                by_name.setdefault(name, []).append(100 * sequence["iou_surface"])
+            for name, sequence in read_metrics(result.files["ood"]).sequences.items():
+                share = look_up(sequence, ("iou_surface",))
+                if share is not None:
+                    by_name.setdefault(one_line(name, 60), []).append(100 * share)
         lines[row.label] = {name: float(np.mean(some)) for name, some in by_name.items()}
     names = sorted({name for line in lines.values() for name in line})
     if len(names) < 2:

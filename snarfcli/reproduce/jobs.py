@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json, write_json
@@ -18,13 +19,28 @@ from snarfcli.locks import inherited_locks, locked
 from snarfcli.reproduce.plans import EvaluationStage, Job
 from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.samples.layout import samples_folder
+from snarfcli.texts import one_line
 
-__all__ = ["LOG", "STATUS", "JobStatus", "JobStopped", "is_evaluated", "read_status", "run_command", "run_job"]
+__all__ = [
+    "LOG",
+    "STATES",
+    "STATUS",
+    "JobStatus",
+    "JobStopped",
+    "is_evaluated",
+    "read_job_status",
+    "read_status",
+    "run_command",
+    "run_job",
+]
 
 STATUS = "reproduce.json"
 """Name of the status file in the run folder."""
 LOG = "reproduce.log"
 """Name of the file in the run folder with the output of its commands."""
+
+STATES = ("running", "done", "failed", "diverged", "stopped")
+"""States of a run."""
 
 _LOCK = ".reproduce.lock"
 _LOOK_EVERY_S = 0.3
@@ -41,7 +57,7 @@ class JobStatus:
     """Status of a run."""
 
     state: str
-    """running, done, failed, diverged or stopped."""
+    """One of `STATES`."""
     digest: str = ""
     """Hash of the settings that it was trained with."""
     trained: bool = False
@@ -90,12 +106,22 @@ def run_job(job: Job, *, stopped: Callable[[], bool] = lambda: False, runner: Ru
 
 
 def read_status(folder: Path) -> JobStatus | None:
-    """Return the recorded status of the run in a folder, or None without one."""
+    """Return the recorded status of the run in a folder, or None without one that can be read."""
+    return read_job_status(folder / STATUS)
+
+
+def read_job_status(path: Path) -> JobStatus | None:
+    """Return the status in a file, or None without one that can be read.
+
+    Raises:
+        OSError, MemoryError: the system cannot read it.
+    """
     try:
-        content = read_json(folder / STATUS)
-        return JobStatus(**content)
-    except (UserError, TypeError):
+        status = read_described(JobStatus, read_json(path), "status", ignore_unknown=True)
+    except (UserError, DescriptionError):
         return None
+    status = replace(status, stage=one_line(status.stage, 20), reason=one_line(status.reason, 500))
+    return status if status.state in STATES else None
 
 
 def is_evaluated(evaluation: EvaluationStage, avatar: Path) -> bool:
@@ -104,10 +130,11 @@ def is_evaluated(evaluation: EvaluationStage, avatar: Path) -> bool:
     if not path.is_file() or not avatar.is_file() or path.stat().st_mtime < avatar.stat().st_mtime:
         return False
     try:
-        settings = read_json(path)["settings"]
-    except (UserError, KeyError, TypeError):
+        content = read_json(path)
+    except UserError:
         return False
-    return all(settings.get(key) == value for key, value in evaluation.settings.items())
+    settings = content.get("settings") if isinstance(content, dict) else None
+    return isinstance(settings, dict) and all(settings.get(key) == value for key, value in evaluation.settings.items())
 
 
 class _Stages:
@@ -162,9 +189,10 @@ class _Stages:
 
     def _has_diverged(self) -> bool:
         try:
-            return read_json(self.folder / "metrics.json").get("status") == "diverged"
-        except (UserError, AttributeError):
+            content = read_json(self.folder / "metrics.json")
+        except UserError:
             return False
+        return isinstance(content, dict) and content.get("status") == "diverged"
 
     def _can_be_evaluated(self, evaluation: EvaluationStage) -> bool:
         """Return whether the samples have frames of this split; a data set without them is no failure of the run."""
@@ -232,9 +260,12 @@ def _samples_exist(folder: str) -> bool:
 def _frames(folder: Path, split: str) -> int | None:
     """Return the number of frames of a split in the samples; None if it is unknown."""
     try:
-        return int(read_json(folder / "manifest.json")["frames"][split])
-    except (UserError, KeyError, TypeError, ValueError):
+        content = read_json(folder / "manifest.json")
+    except UserError:
         return None
+    frames = content.get("frames") if isinstance(content, dict) else None
+    count = frames.get(split) if isinstance(frames, dict) else None
+    return count if type(count) is int else None
 
 
 def _reason(log: Path, begin: int, code: int) -> str:

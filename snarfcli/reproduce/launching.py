@@ -8,8 +8,8 @@ Ctrl-C reaches all of them: each lets its command write a checkpoint and ends.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
-import json
 import logging
 import os
 import secrets
@@ -22,12 +22,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.interrupts import signals_as_interrupts
 from snarfcli.locks import hold_output, holder_is_gone, inherited_locks, lock_file, one_of, try_lock
-from snarfcli.reproduce.jobs import JobStatus, run_job
+from snarfcli.reproduce.jobs import JobStatus, read_job_status, run_job
 from snarfcli.reproduce.plans import Job
 from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.texts import one_line
@@ -41,7 +42,16 @@ LAUNCHERS = ("basic", "joblib", "submitit_local", "submitit_slurm")
 
 _PACKAGES = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit"}
 _LOOK_EVERY_S = 0.5
+_MOST_SLOTS = 10_000
 _TIME_LIMIT_MIN = 7 * 24 * 60  # the default of submitit is an hour
+
+
+@dataclass(frozen=True)
+class _PlannedJobs:
+    """Content of a plan file."""
+
+    slots: int | None
+    jobs: tuple[Job, ...]
 
 
 @dataclass(frozen=True)
@@ -170,12 +180,7 @@ def run_planned_job(plan: Path, number: int) -> None:
     Raises:
         UserError: the plan or the job does not exist.
     """
-    content = read_json(plan, "plan")
-    try:
-        job = Job.from_dict(content["jobs"][number])
-        slots = content["slots"]
-    except (KeyError, IndexError, TypeError):
-        raise UserError(f"plan {plan} has no job {number}; use a plan that snarf reproduce has written") from None
+    job, slots = read_planned_job(plan, number)
     result, stop = plan.with_name(f"{number}.json"), plan.with_name("stop")
 
     def stopped() -> bool:
@@ -195,6 +200,21 @@ def run_planned_job(plan: Path, number: int) -> None:
     except Exception as error:  # a fault of the program or a full disk; the other jobs still run
         status = JobStatus("failed", job.digest, stage="reproduce", reason=f"{type(error).__name__}: {one_line(error)}")
     write_json(result, asdict(status))
+
+
+def read_planned_job(plan: Path, number: int) -> tuple[Job, int | None]:
+    """Return a job of the plan in a file, and how many jobs may run at a time; None for any number.
+
+    Raises:
+        UserError: the plan or the job does not exist, or the plan is damaged.
+    """
+    try:
+        content = read_described(_PlannedJobs, read_json(plan, "plan"), "plan", ignore_unknown=True)
+    except DescriptionError as error:
+        raise UserError(f"plan {plan} is damaged ({error}); use a plan that snarf reproduce has written") from None
+    if not 0 <= number < len(content.jobs) or (content.slots is not None and not 0 < content.slots <= _MOST_SLOTS):
+        raise UserError(f"plan {plan} has no job {number}; use a plan that snarf reproduce has written")
+    return content.jobs[number], content.slots
 
 
 def _arguments(work: Path, count: int, launcher: Launcher) -> list[str]:
@@ -222,10 +242,9 @@ def _slots(launcher: Launcher) -> int | None:
 
 
 def _read(path: Path) -> JobStatus | None:
-    try:
-        return JobStatus(**json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError):
-        return None
+    with contextlib.suppress(OSError):  # on a network drive, while it is replaced
+        return read_job_status(path)
+    return None
 
 
 def _stop(process: subprocess.Popen[Any], work: Path) -> None:

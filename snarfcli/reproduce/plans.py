@@ -87,13 +87,6 @@ class Job:
         """Name in progress lines."""
         return f"{self.label}, subject {self.subject}, seed {self.seed}"
 
-    @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> Job:
-        """Return the job that `dataclasses.asdict` has turned into `content`."""
-        samples = tuple(SamplesStage(one["folder"], tuple(one["arguments"])) for one in content["samples"])
-        evaluations = tuple(EvaluationStage(**{**one, "arguments": tuple(one["arguments"])}) for one in content["evaluations"])
-        return cls(**{**content, "samples": samples, "train": tuple(content["train"]), "evaluations": evaluations})
-
 
 @dataclass(frozen=True)
 class Plan:

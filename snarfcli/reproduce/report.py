@@ -10,11 +10,11 @@ from typing import Any
 
 import snarfcli
 from snarfcli.errors import UserError
-from snarfcli.files import atomic_path, read_json, write_json
+from snarfcli.files import atomic_path, write_json
 from snarfcli.reproduce import figures
 from snarfcli.reproduce.papers import paper_source
 from snarfcli.reproduce.plans import Plan
-from snarfcli.reproduce.results import COLUMNS, Result
+from snarfcli.reproduce.results import COLUMNS, Result, read_metrics
 from snarfcli.reproduce.tables import csv_table, markdown_runs, markdown_table, more_columns, order_lines
 
 __all__ = ["write_report"]
@@ -160,10 +160,10 @@ def _copy(result: Result, folder: Path) -> dict[str, str]:
     links = {}
     for stage, path in result.files.items():
         relative = Path("runs") / result.job.subject / Path(result.job.folder).name / _COPIES[stage]
-        content = read_json(path, "metrics")
-        for sequence in content.get("sequences", {}).values():
+        metrics = read_metrics(path)
+        for sequence in metrics.sequences.values():
             sequence.pop("per_frame", None)
-        write_json(folder / relative, content)
+        write_json(folder / relative, metrics.content | ({"sequences": metrics.sequences} if metrics.sequences else {}))
         links[stage] = relative.as_posix()
     return links
 
@@ -173,8 +173,8 @@ def _machines(results: Sequence[Result]) -> str:
     names = {}
     for result in results:
         if "train" in result.files:
-            content = read_json(result.files["train"], "metrics")
-            machine, versions = content.get("machine", {}), content.get("versions", {})
+            metrics = read_metrics(result.files["train"])
+            machine, versions = metrics.machine, metrics.versions
             parts = [machine.get("processor"), f"{machine.get('cores')} cores", f"{machine.get('threads')} threads per run"]
             parts += [machine.get("gpu"), f"{machine.get('system')}, PyTorch {versions.get('torch')}"]
             names[", ".join(str(part) for part in parts if part)] = None

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.files import read_json
 from snarfcli.reproduce.jobs import JobStatus, is_evaluated, read_status
 from snarfcli.reproduce.plans import Job
 
-__all__ = ["COLUMNS", "MORE_COLUMNS", "Cell", "Column", "Result", "collect", "summarise"]
+__all__ = ["COLUMNS", "MORE_COLUMNS", "Cell", "Column", "Metrics", "Result", "collect", "look_up", "read_metrics", "summarise"]
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,20 @@ MORE_COLUMNS = (
            ("weights", "right_bone"), 100),
 )  # fmt: skip
 """Columns of the second table; columns without a number are left out."""
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """A file of metrics of `snarf train` or `snarf eval`."""
+
+    sequences: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Numbers of each sequence by its name."""
+    machine: dict[str, Any] = field(default_factory=dict)
+    """The machine."""
+    versions: dict[str, Any] = field(default_factory=dict)
+    """Versions of packages."""
+    content: dict[str, Any] = field(default_factory=dict)
+    """The whole file."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +158,10 @@ def collect(job: Job) -> Result:
     for evaluation in job.evaluations if "train" in files else ():
         if is_evaluated(evaluation, folder / "avatar.pt"):
             files[evaluation.split] = Path(evaluation.metrics)
-    contents = {stage: _read(path) for stage, path in files.items()}
+    contents = {stage: _known(path) for stage, path in files.items()}
     for column in (*COLUMNS, *MORE_COLUMNS):
         content = contents.get(column.stage)
-        value = None if content is None else _training_min(content) if not column.path else _look_up(content, column.path)
+        value = None if content is None else _training_min(content) if not column.path else look_up(content, column.path)
         if value is not None:
             values[column.key] = value * column.scale
     return Result(job, *_state(status, job, files), values, files)
@@ -184,21 +199,38 @@ def _state(status: JobStatus, job: Job, files: dict[str, Path]) -> tuple[str, st
     return "stopped", f"interrupted at {status.stage or 'the start'}"
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_metrics(path: Path) -> Metrics:
+    """Return what the reports need of a file of metrics.
+
+    Raises:
+        UserError: the file is missing or damaged.
+        OSError, MemoryError: the system cannot read it.
+    """
+    content = read_json(path, "metrics")
     try:
-        content = read_json(path, "metrics")
+        known = read_described(Metrics, content, "metrics", ignore_unknown=True)
+    except DescriptionError as error:
+        raise UserError(f"metrics {path} are damaged ({error}); run the command that wrote them again") from None
+    return replace(known, content=content)
+
+
+def _known(path: Path) -> dict[str, Any]:
+    """Return the numbers of a run; none if its file is damaged, so that the table shows the others."""
+    try:
+        return read_metrics(path).content
     except UserError:
         return {}
-    return content if isinstance(content, dict) else {}
 
 
-def _look_up(content: Any, path: Sequence[str]) -> float | None:
+def look_up(content: Any, path: Sequence[str]) -> float | None:
+    """Return the finite number that names lead to in nested dicts, or None if there is none."""
     for name in path:
         content = content.get(name) if isinstance(content, dict) else None
-    return content if isinstance(content, (int, float)) and math.isfinite(content) else None
+    is_number = isinstance(content, (int, float)) and not isinstance(content, bool)
+    return content if is_number and math.isfinite(content) else None
 
 
 def _training_min(content: dict[str, Any]) -> float | None:
     """Return the time of the whole training. (The file of a resumed training has the wall time of its last part only.)"""
-    step_s, steps = _look_up(content, ("timings", "seconds_per_step")), _look_up(content, ("steps",))
+    step_s, steps = look_up(content, ("timings", "seconds_per_step")), look_up(content, ("steps",))
     return None if step_s is None or steps is None else step_s * steps / 60

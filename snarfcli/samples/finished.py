@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,7 @@ from snarfcli.errors import UserError
 from snarfcli.files import read_json, read_npz, write_arrays
 from snarfcli.samples.frames import frame_arrays, frame_numbers
 from snarfcli.samples.layout import SEQUENCE_FILES
+from snarfcli.samples.manifests import is_sequence
 from snarfcli.samples.writing import settings_digest
 from snarfcli.sampling import check_mesh
 
@@ -67,12 +69,7 @@ def write_subject(folder: Path, subject: SubjectData, inside_test: str) -> None:
     except UserError:
         raise UserError(f"the samples are damaged: {path} cannot be read; start again with overwrite=true") from None
     for name in sorted(arrays.keys() | there.keys()):
-        same = name in arrays and name in there and there[name].shape == arrays[name].shape
-        if same and arrays[name].dtype.kind == "f":
-            same = np.allclose(there[name], arrays[name], rtol=0.0, atol=_POSE_TOLERANCE)
-        elif same:
-            same = np.array_equal(there[name], arrays[name])
-        if not same:
+        if name not in arrays or name not in there or not _is_close(there[name], arrays[name]):
             raise UserError(
                 f"the samples in {folder} were made from another body ({name} differs); start again with overwrite=true"
             )
@@ -98,27 +95,34 @@ def complete_sequences(
         if not (place / "sequence.json").exists():
             continue
         entry, there = {}, {}
-        try:
+        is_whole = False
+        with contextlib.suppress(UserError):  # damaged; errors of the system end the command
             entry = read_json(place / "sequence.json", "samples")
-            sizes = {name: entry["files"][name]["bytes"] for name in SEQUENCE_FILES}
-            is_whole = entry["settings_digest"] == settings_digest(settings)
-            is_whole &= all((place / name).is_file() and (place / name).stat().st_size == size for name, size in sizes.items())
+            is_whole = is_sequence(entry) and entry.get("settings_digest") == settings_digest(settings)
+            is_whole = is_whole and all(_has_size(place / name, entry["files"][name]["bytes"]) for name in SEQUENCE_FILES)
             there = read_npz(place / "frames.npz", "samples") if is_whole else {}
-        except (UserError, KeyError, TypeError):
-            is_whole = False
         frames = frame_numbers(spec, frame_steps)
         wanted = frame_arrays(subject.skeleton, spec, frames)
         if not is_whole or not wanted.keys() <= there.keys():
             log.warning("%s/%s is damaged and is made again", spec.split, spec.name)
             continue
-        differs = [
-            name
-            for name, array in wanted.items()
-            if there[name].shape != array.shape or not np.allclose(there[name], array, rtol=0.0, atol=_POSE_TOLERANCE)
-        ]
+        differs = [name for name, array in wanted.items() if not _is_close(there[name], array)]
         if not differs and entry.get("source") != spec.meshes.fingerprint():
             raise UserError(f"{place} was made from other meshes (the files have changed); {_ADVICE}")
         if differs:
             raise UserError(f"{place} was made from another motion ({differs[0]} differs); {_ADVICE}")
         done[spec.split, spec.name] = entry
     return done
+
+
+def _has_size(path: Path, size: int) -> bool:
+    return path.is_file() and path.stat().st_size == size
+
+
+def _is_close(there: np.ndarray, wanted: np.ndarray) -> bool:
+    """Return whether an array in a file is the wanted one; numbers may differ by rounding."""
+    if there.shape != wanted.shape or there.dtype.kind != wanted.dtype.kind:
+        return False
+    if wanted.dtype.kind == "f":
+        return np.allclose(there, wanted, rtol=0.0, atol=_POSE_TOLERANCE)
+    return np.array_equal(there, wanted)

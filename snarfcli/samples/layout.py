@@ -15,15 +15,14 @@ The folder of a subject `{root}/processed/{data}/{subject}` contains
 
 from __future__ import annotations
 
-import zipfile
-import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from snarfcli.errors import UserError
-from snarfcli.files import file_digest
+from snarfcli.files import file_digest, map_npy, read_npz
 
 __all__ = [
     "FORMAT_VERSION",
@@ -31,6 +30,7 @@ __all__ = [
     "check_digest",
     "check_format",
     "check_sizes",
+    "checked_array",
     "open_array",
     "read_arrays",
     "repair_advice",
@@ -56,9 +56,10 @@ def check_format(description: Any, folder: Path) -> None:
         UserError: the version differs, or there is none.
     """
     version = description.get("format_version") if isinstance(description, dict) else None
-    if version != FORMAT_VERSION:
+    if type(version) is not int or version != FORMAT_VERSION:
+        came = version if type(version) is int and abs(version) < 2**63 else "none"
         raise UserError(
-            f"the samples in {folder}: wanted format version {FORMAT_VERSION}, got {version}; "
+            f"the samples in {folder}: wanted format version {FORMAT_VERSION}, got {came}; "
             'make them again: "snarf preprocess ... overwrite=true"'
         )
 
@@ -100,28 +101,50 @@ def open_array(path: Path, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     """Memory-map a `.npy` file.
 
     Raises:
-        UserError: it cannot be read, or has another shape or type.
+        UserError: it is damaged, or has another shape or type.
+        OSError: the system cannot read it.
     """
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise UserError(f"the samples are damaged: {path} cannot be read ({error}); {repair_advice(path.parent)}") from None
-    if array.shape != shape or array.dtype != dtype:
-        raise UserError(
-            f"the samples are damaged: {path}: wanted {np.dtype(dtype)} {list(shape)}, "
-            f"got {array.dtype} {list(array.shape)}; {repair_advice(path.parent)}"
-        )
-    return array
+        return map_npy(path, shape, dtype)
+    except UserError as error:
+        reason = str(error).partition("; ")[0]  # without its advice
+        raise UserError(f"the samples are damaged: {reason}; {repair_advice(path.parent)}") from None
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read an `.npz` archive of the samples.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: it is damaged.
+        OSError, MemoryError: the system cannot read it.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"the samples are damaged: {path} cannot be read ({error}); {repair_advice(path.parent)}") from None
+        return read_npz(path)
+    except UserError as error:
+        reason = str(error).rpartition("; ")[0] or error  # without its advice
+        raise UserError(f"the samples are damaged: {reason}; {repair_advice(path.parent)}") from None
+
+
+def checked_array(
+    arrays: Mapping[str, np.ndarray], name: str, dtype: type, shape: tuple[int | None, ...], *, least: float | None = None
+) -> np.ndarray:
+    """Return an array of an archive, if it has the type and shape with which it is written and finite values.
+
+    Args:
+        arrays: of the archive.
+        name: of the array.
+        dtype: its type.
+        shape: its shape; None for any length.
+        least: minimum of its values; None for any.
+
+    Raises:
+        KeyError, ValueError: it does not.
+    """
+    array = arrays[name]
+    is_fitting = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+    if array.dtype != dtype or not is_fitting:
+        wanted = ", ".join("any" if n is None else str(n) for n in shape)
+        raise ValueError(f"{name}: wanted {np.dtype(dtype)} [{wanted}], got {array.dtype} {list(array.shape)[:9]}")
+    if not np.isfinite(array).all() or (least is not None and array.size and array.min() < least):
+        raise ValueError(f"{name}: wanted finite numbers{'' if least is None else f' from {least:g}'}, got others")
+    return array

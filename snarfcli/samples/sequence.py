@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from snarfcli.datasets.splits import Split
-from snarfcli.samples.layout import check_digest, check_sizes, open_array, read_arrays
+from snarfcli.errors import UserError
+from snarfcli.samples.layout import check_digest, check_sizes, checked_array, open_array, read_arrays, repair_advice
 from snarfcli.sampling.cube import dequantise, unpack_vertices
+from snarfcli.texts import one_line
 
 __all__ = ["Frame", "SequenceSamples"]
 
@@ -31,7 +33,7 @@ class SequenceSamples:
             description: content of its `sequence.json`.
 
         Raises:
-            UserError: a file is missing or has a wrong size.
+            UserError: a file is missing, has a wrong size or wrong content.
         """
         self.folder = folder
         self.description = description
@@ -42,7 +44,7 @@ class SequenceSamples:
         check_sizes(folder, description["files"])
         self._cells = open_array(folder / "points.npy", (self.num_frames, self.num_points, 3), np.uint16)
         self._packed = open_array(folder / "occupancies.npy", (self.num_frames, self.num_points // 8), np.uint8)
-        arrays = read_arrays(folder / "frames.npz")
+        arrays = _frame_arrays(folder / "frames.npz", self.num_frames)
         self._vertex_start, self._face_start = arrays["vertex_start"], arrays["face_start"]
         self._topology = arrays["topology"]
         self.poses: np.ndarray = arrays["poses"]
@@ -117,9 +119,18 @@ class SequenceSamples:
         return unpack_vertices(cells, self._cube_lower[frame], self._cube_size[frame])
 
     def faces(self, frame: int) -> np.ndarray:
-        """Return the faces [F, 3] of the mesh of one frame, int32, outward."""
+        """Return the faces [F, 3] of the mesh of one frame, int32, outward.
+
+        Raises:
+            UserError: they name vertices that the mesh does not have.
+        """
         topology = self._topology[frame]
-        return np.array(self._faces[self._face_start[topology] : self._face_start[topology + 1]])
+        faces = np.array(self._faces[self._face_start[topology] : self._face_start[topology + 1]])
+        count = self._vertex_start[frame + 1] - self._vertex_start[frame]
+        if faces.size and not 0 <= faces.min() <= faces.max() < count:
+            there = f"{self.folder / 'faces.npy'} names other vertices than the {count} of frame {frame}"
+            raise UserError(f"the samples are damaged: {there}; {repair_advice(self.folder)}")
+        return faces
 
     def box(self, frame: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounding box of the posed mesh of one frame: lower [3] and upper [3] corner, float32, metres."""
@@ -141,6 +152,42 @@ class SequenceSamples:
 
 Frame = tuple[SequenceSamples, int]
 """A sequence and the index of one of its frames."""
+
+
+def _frame_arrays(path: Path, num_frames: int) -> dict[str, np.ndarray]:
+    """Return the arrays of `frames.npz`.
+
+    Raises:
+        UserError: one is missing, or has another type, shape or values than it is written with.
+    """
+    arrays = read_arrays(path)
+    try:
+        joints = checked_array(arrays, "poses", np.float32, (num_frames, None, 3)).shape[1]
+        for name, shape in (
+            ("translation", (3,)), ("posed_from_canonical", (joints, 4, 4)), ("joints", (joints, 3)),
+            ("cube_lower", (3,)), ("cube_size", ()), ("box_lower", (3,)), ("box_upper", (3,)),
+        ):  # fmt: skip
+            checked_array(arrays, name, np.float32, (num_frames, *shape), least=0.0 if name == "cube_size" else None)
+        if (np.diff(checked_array(arrays, "frame_numbers", np.int64, (num_frames,), least=0)) <= 0).any():
+            raise ValueError("frame_numbers: wanted rising numbers, got others")
+        topology = checked_array(arrays, "topology", np.int64, (num_frames,), least=0)
+        _check_starts(arrays, "vertex_start", num_frames)
+        _check_starts(arrays, "face_start", 1 + int(topology.max()))
+    except (KeyError, ValueError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else one_line(error, 200)
+        raise UserError(f"the samples are damaged: {path}: {reason}; {repair_advice(path.parent)}") from None
+    return arrays
+
+
+def _check_starts(arrays: dict[str, np.ndarray], name: str, count: int) -> None:
+    """Check the starts of `count` parts that follow each other, and the end of the last.
+
+    Raises:
+        KeyError, ValueError: they are not in order.
+    """
+    starts = checked_array(arrays, name, np.int64, (None,), least=0)
+    if len(starts) != count + 1 or starts[0] != 0 or (np.diff(starts) < 0).any():
+        raise ValueError(f"{name}: wanted the starts of {count} parts in order, got {len(starts)} numbers")
 
 
 def _rows(frames: int | np.ndarray, index: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -12,8 +12,10 @@ from snarfcli.bodies.template import MeshTemplate
 from snarfcli.datasets.splits import SPLITS
 from snarfcli.errors import UserError, nearest
 from snarfcli.files import read_json
-from snarfcli.samples.layout import check_digest, check_format, check_sizes, read_arrays, repair_advice, samples_folder
+from snarfcli.samples.layout import check_digest, check_sizes, checked_array, read_arrays, repair_advice, samples_folder
+from snarfcli.samples.manifests import check_manifest
 from snarfcli.samples.sequence import SequenceSamples
+from snarfcli.texts import one_line
 
 __all__ = ["SampleStore"]
 
@@ -28,21 +30,33 @@ class SampleStore:
     """All processed samples of one subject."""
 
     def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
-        """Open the store in `folder`; `open` also checks that it exists and has the right version."""
+        """Open the store in `folder`; `open` also checks its manifest.
+
+        Raises:
+            UserError: the samples are damaged.
+        """
         self.folder = folder
         self.manifest = manifest
         self.data: str = manifest["data"]
         self.subject: str = manifest["subject"]
         check_sizes(folder, manifest["files"])
         arrays = read_arrays(folder / "subject.npz")
-        self.skeleton: Skeleton = Skeleton.from_dict(arrays)
-        self.template: MeshTemplate | None = None
-        """Mesh of the subject in the canonical pose, float32; None if the data set has none."""
-        if "vertices_canonical" in arrays:
-            self.template = MeshTemplate(arrays["vertices_canonical"], arrays["faces"], arrays["vertex_weights"])
-        self.betas: np.ndarray = arrays["betas"]
-        """[S], float32, shape parameters of the body model; S is 0 without a body model."""
+        try:
+            self.skeleton: Skeleton = Skeleton.from_dict(arrays)
+            self.template: MeshTemplate | None = _template(arrays, self.skeleton.num_joints)
+            """Mesh of the subject in the canonical pose, float32; None if the data set has none."""
+            self.betas: np.ndarray = checked_array(arrays, "betas", np.float32, (None,))
+            """[S], float32, shape parameters of the body model; S is 0 without a body model."""
+        except (KeyError, TypeError, ValueError) as error:
+            reason = f"no {error}" if isinstance(error, KeyError) else one_line(error, 200)
+            raise UserError(f"the samples are damaged: {folder / 'subject.npz'}: {reason}; {repair_advice(folder)}") from None
         self._sequences = [SequenceSamples(folder / entry["split"] / entry["name"], entry) for entry in manifest["sequences"]]
+        for sequence in self._sequences:
+            if sequence.poses.shape[1] != self.skeleton.num_joints:
+                there = (
+                    f"{sequence.folder} has poses of {sequence.poses.shape[1]} joints, the subject {self.skeleton.num_joints}"
+                )
+                raise UserError(f"the samples are damaged: {there}; {repair_advice(folder)}")
 
     @classmethod
     def open(cls, root: str | Path, data: str, subject: str) -> SampleStore:
@@ -65,13 +79,8 @@ class SampleStore:
                 raise UserError(f"{begun}; {command}, with the settings it began with, to go on")
             raise UserError(f"no samples of subject {subject} under {folder.parent}; {command}")
         manifest = read_json(folder / "manifest.json", "manifest of the samples")
-        check_format(manifest, folder)
-        try:
-            return cls(folder, manifest)
-        except (KeyError, TypeError) as error:
-            raise UserError(
-                f"the samples are damaged: {folder} lacks {error} or has another type of it; {repair_advice(folder)}"
-            ) from None
+        check_manifest(manifest, folder)
+        return cls(folder, manifest)
 
     @property
     def all_sequences(self) -> list[SequenceSamples]:
@@ -104,3 +113,19 @@ class SampleStore:
             check_digest(self.folder / name, entry["sha256"])
         for sequence in self._sequences:
             sequence.verify()
+
+
+def _template(arrays: dict[str, np.ndarray], num_joints: int) -> MeshTemplate | None:
+    """Return the mesh in `subject.npz`, or None if it has none.
+
+    Raises:
+        KeyError, ValueError: it is damaged.
+    """
+    if "vertices_canonical" not in arrays:
+        return None
+    vertices = checked_array(arrays, "vertices_canonical", np.float32, (None, 3))
+    weights = checked_array(arrays, "vertex_weights", np.float32, (len(vertices), num_joints))
+    faces = checked_array(arrays, "faces", np.int32, (None, 3))
+    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ValueError(f"faces: wanted vertices from 0 to {len(vertices) - 1}, got others")
+    return MeshTemplate(vertices, faces, weights)

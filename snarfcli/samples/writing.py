@@ -19,6 +19,7 @@ from snarfcli.errors import UserError
 from snarfcli.files import file_digest, flush_to_disk, read_json, remove_temporaries, write_arrays, write_json
 from snarfcli.samples.layout import FORMAT_VERSION, SEQUENCE_FILES, check_format
 from snarfcli.sampling.points import FrameSamples
+from snarfcli.texts import one_line
 
 __all__ = [
     "SequenceWriter",
@@ -194,12 +195,13 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any]) -> None:
             continue
         there = read_json(path, "samples")
         check_format(there, folder)
-        before = there.get("settings", {})
+        before = there.get("settings")
+        before = before if isinstance(before, dict) else {}
         names = [name for name in {**settings, **before} if settings.get(name) != before.get(name)]
         if names:
-            changes = ", ".join(f"{name} {before.get(name)} -> {settings.get(name)}" for name in names)
+            changes = ", ".join(f"{name} {str(before.get(name))[:60]} -> {settings.get(name)}" for name in names[:9])
             raise UserError(
-                f"the samples in {folder} were made with other settings ({changes}); "
+                f"the samples in {folder} were made with other settings ({one_line(changes, 400)}); "
                 "keep those settings, or start again with overwrite=true"
             )
 

@@ -9,10 +9,33 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-__all__ = ["FeatureGrids"]
+__all__ = ["FeatureGrids", "grid_nodes"]
 
 _MOST_NODES = 2**25  # of all levels; a row number takes four bytes of each, features only those that are covered
+_LEAST_CELL = 1e-9  # of the longest side of the box; smaller cells are counted as these, which are far too many anyway
 _START = 1e-4  # features start within this of zero, as in Mueller et al.
+
+
+def grid_nodes(lower: Tensor, upper: Tensor, cells_m: Sequence[float]) -> list[list[int]]:
+    """Return the numbers of nodes W, H, D of feature grids.
+
+    Args:
+        lower, upper: corners of the box, [3], metres.
+        cells_m: side of a cell of each level, metres.
+
+    Raises:
+        ValueError: a level is coarser than the box, or its cells are not positive.
+    """
+    extent = [float(side) for side in upper - lower]
+    levels = []
+    for cell in cells_m:
+        if not 0 < cell <= max(extent):
+            raise ValueError(
+                f"shape.feature_cells_m: wanted cells of more than 0 and at most {max(extent):.3g} m, the longest side of "
+                f"the canonical box, got {cell:g}"
+            )
+        levels.append([math.ceil(side / max(cell, _LEAST_CELL * max(extent)) - 1e-6) + 1 for side in extent])
+    return levels
 
 
 class FeatureGrids(nn.Module):
@@ -44,15 +67,9 @@ class FeatureGrids(nn.Module):
         self.boxes: list[float] = []
         """Position of the first node and sides of a cell of each level, metres."""
         extent = [float(side) for side in upper - lower]
-        for cell in cells_m:
-            if not 0 < cell <= max(extent):
-                raise ValueError(
-                    f"shape.feature_cells_m: wanted cells of more than 0 and at most {max(extent):.3g} m, the longest side of "
-                    f"the canonical box, got {cell:g}"
-                )
-            counts = [math.ceil(side / cell - 1e-6) for side in extent]
-            self.nodes += [count + 1 for count in counts]
-            self.boxes += [float(x) for x in lower] + [side / count for side, count in zip(extent, counts, strict=True)]
+        for level in grid_nodes(lower, upper, cells_m):
+            self.nodes += level
+            self.boxes += [float(x) for x in lower] + [side / (n - 1) for side, n in zip(extent, level, strict=True)]
         if self.num_nodes > _MOST_NODES:
             finest = (math.prod(extent) / _MOST_NODES * 1.5) ** (1 / 3)
             raise ValueError(
@@ -117,6 +134,8 @@ class FeatureGrids(nn.Module):
         if isinstance(table, Tensor) and table.ndim == 2 and table.shape[1] == self.features:
             self.table = nn.Parameter(self.table.new_empty(table.shape))
         super()._load_from_state_dict(state_dict, prefix, *arguments)
+        if len(self.rows) and int(self.rows.min()) < -1:
+            arguments[-1].append(f"{prefix}rows: wanted rows from -1, got {int(self.rows.min())}")
         if len(self.rows) and int(self.rows.max()) >= len(self.table):
             arguments[-1].append(
                 f"{prefix}rows names {int(self.rows.max()) + 1} rows of features, {prefix}table has {len(self.table)}"

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from snarfcli.models.file_tensors import read_tensor
 from snarfcli.native.backend import choose_backend
 from snarfcli.native.cpu_optimizer import adam_step
 from snarfcli.training.settings import TrainingConfig
@@ -117,17 +118,14 @@ class AveragedAdam:
         """
         self.parameters = self._trained()
         moments = state["optimizer"]
-        given = (state["average"], moments["first"], moments["second"])
-        self.average, self._first, self._second = ([self._like(*p) for p in self._paired(values)] for values in given)
-
-    def _paired(self, values: list[Tensor]) -> zip[tuple[Tensor, Tensor]]:
-        return zip(values, self.parameters, strict=True)
+        given = {"average": state["average"], "first": moments["first"], "second": moments["second"]}
+        self.average, self._first, self._second = (
+            [self._like(*pair, name) for pair in zip(values, self.parameters, strict=True)] for name, values in given.items()
+        )
 
     @staticmethod
-    def _like(value: Tensor, parameter: Tensor) -> Tensor:
-        if value.shape != parameter.shape:
-            raise ValueError(f"wanted {list(parameter.shape)} numbers of the optimiser, got {list(value.shape)}")
-        return _copy(value.to(parameter.detach()))
+    def _like(value: Any, parameter: Tensor, name: str) -> Tensor:
+        return _copy(read_tensor(value, f"optimizer.{name}", parameter.shape, parameter.dtype).to(parameter.detach()))
 
 
 def _copy(value: Tensor) -> Tensor:

@@ -16,15 +16,18 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from snarfcli.deformer import NodeWeights
-from snarfcli.errors import UserError
+from snarfcli.descriptions import DescriptionError, check_plain
+from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.evaluation.metrics import iou
 from snarfcli.fitting import PoseRefiner, require_refinable
 from snarfcli.models.extent import bone_owners, bone_segments
 from snarfcli.models.fast_snarf import FastSnarf
+from snarfcli.models.file_tensors import load_state, read_state, read_tensor
 from snarfcli.models.system import Found
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.precision import PRECISIONS, matmul_precision
 from snarfcli.samples.store import SampleStore
+from snarfcli.texts import one_line
 from snarfcli.training.batches import Batch, load_frames, new_batches
 from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
 from snarfcli.training.made_up_poses import MadeUpPoses
@@ -296,10 +299,11 @@ class Trainer:
             UserError: the state has other settings, or does not fit.
         """
         same = {"workers": self.config.workers}  # the steps do not depend on it
-        ours = self.avatar.to_dict()["config"] | {"training": asdict(self.config), "seed": self.seed}
+        ours = asdict(self.avatar.config) | {"training": asdict(self.config), "seed": self.seed}
         try:
             theirs = state["avatar"]["config"] | {"training": state["training"] | same, "seed": state["seed"]}
-        except (KeyError, TypeError):
+            check_plain(theirs, "settings")
+        except (KeyError, TypeError, DescriptionError):
             raise UserError(f"{path} is incomplete; start again with overwrite=true") from None
         changed = _differences(theirs, ours)
         if changed:
@@ -308,17 +312,35 @@ class Trainer:
                 "overwrite=true to start again, or run=NAME for another folder"
             )
         try:
-            self.model.load_state_dict(state["avatar"]["state"])
+            load_state(self.model, read_state(state["avatar"]["state"]))
             self.optimizer.restore(state)
             if self.refiner is not None:
                 self.refiner.restore(state["poses"])
-            torch.set_rng_state(state["random"])
-            self.step = int(state["step"])
-            self.seconds = float(state.get("seconds", 0.0))
-        except (KeyError, RuntimeError, TypeError, ValueError) as error:
-            reason = str(error).splitlines()[0]
+            torch.set_rng_state(read_tensor(state["random"], "random", torch.get_rng_state().shape, torch.uint8))
+            self.step = self._checked_step(state["step"])
+            self.seconds = self._checked_seconds(state.get("seconds", 0.0))
+        except (LookupError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+            if is_out_of_memory(error):
+                raise
+            reason = f"no {error}" if isinstance(error, KeyError) else one_line(error, 300)
             raise UserError(f"{path} does not fit this version ({reason}); start again with overwrite=true") from None
         self.model.train()
+
+    def _checked_step(self, step: Any) -> int:
+        """Return the number of the step in a checkpoint.
+
+        Raises:
+            ValueError: it is none of this training.
+        """
+        if type(step) is not int or not 0 <= step <= self.config.steps:
+            raise ValueError(f"step: wanted 0 to {self.config.steps}, got another")
+        return step
+
+    def _checked_seconds(self, seconds: Any) -> float:
+        """Return the time in a checkpoint; ValueError if it is none."""
+        if type(seconds) not in (int, float) or not 0 <= seconds < math.inf:
+            raise ValueError("seconds: wanted a number from 0, got another")
+        return float(seconds)
 
 
 def _differences(theirs: Any, ours: Any, prefix: str = "") -> list[str]:
@@ -327,4 +349,4 @@ def _differences(theirs: Any, ours: Any, prefix: str = "") -> list[str]:
         names = sorted(set(theirs) | set(ours))
         parts = [_differences(theirs.get(n), ours.get(n), f"{prefix}.{n}" if prefix else n) for n in names]
         return [line for part in parts for line in part]
-    return [] if theirs == ours else [f"{prefix}: {theirs} there, {ours} here"]
+    return [] if theirs == ours else [one_line(f"{prefix}: {str(theirs)[:60]} there, {ours} here")]

@@ -150,8 +150,18 @@ def test_unwritable_and_full_folders_are_named():
     full = OSError(28, "No space left on device", "outputs/x")
     assert "outputs/x: the disk is full" in user_message(full)
     denied = PermissionError(13, "Permission denied", "/locked/x")
-    assert "/locked/x: no permission; choose another folder with output_root" in user_message(denied)
+    assert "/locked/x: no permission; change its permissions, or name another place (output_root=" in user_message(denied)
+    many = OSError(24, "Too many open files", "data/x.npy")
+    assert user_message(many) == "data/x.npy: too many open files; raise the limit with `ulimit -n`"
     assert user_message(RuntimeError("a fault of the program")) is None
+
+
+def test_too_little_memory_is_told():
+    told = "not enough memory; close other programs, or choose smaller sizes"
+    assert user_message(MemoryError()) == told
+    assert user_message(RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 9 bytes")) == told
+    own = "not enough memory to read x; close other programs"
+    assert user_message(MemoryError(own)) == own
 
 
 def test_user_error_inside_another_error_is_found():

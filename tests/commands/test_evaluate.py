@@ -13,6 +13,7 @@ import torch
 from toy_training import avatar_config, new_avatar, toy_store
 
 from snarfcli.avatar import Avatar
+from snarfcli.commands import evaluate as commands
 from snarfcli.commands.evaluate import EvalConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import SearchConfig
@@ -273,3 +274,24 @@ def test_surfaces_are_compared(config, store, caplog):
     assert read(folder_of(config) / "eval_id")["surfaces"] is None
     with pytest.raises(UserError, match="surface_frames: wanted at least 0, got -1"):
         run(replace(config, surface_frames=-1))
+
+
+def test_values_that_are_nan_end_the_evaluation(config, monkeypatch):
+    def broken(self, found, pose):
+        values = shape_at(self, found, pose)
+        values.logits[..., 3] = torch.nan
+        return values
+
+    shape_at = Avatar.shape_at
+    monkeypatch.setattr(Avatar, "shape_at", broken)
+    with pytest.raises(UserError, match=r"frame \d+: the avatar's occupancy is NaN at 1 of \d+ points; train it again"):
+        run(config)
+    assert not (folder_of(config) / "eval_id").exists()
+
+
+def test_results_that_are_nan_are_not_written(config, monkeypatch):
+    monkeypatch.setattr(commands, "measure_weights", lambda *_: {"wrong_share": float("nan"), "vertices": 3})
+    monkeypatch.setattr(commands, "weights_text", str)
+    with pytest.raises(UserError, match=r"weights\.wrong_share is nan, so nothing was written"):
+        run(config)
+    assert not (folder_of(config) / "eval_id").exists()

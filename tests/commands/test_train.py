@@ -139,7 +139,7 @@ def test_a_damaged_checkpoint_is_named_and_left(config):
     folder_of(config).mkdir(parents=True)
     path = folder_of(config) / "checkpoint.pt"
     path.write_bytes(b"half of a checkpoint")
-    with pytest.raises(UserError, match=r"checkpoint.*is truncated or is not a file of snarf"):
+    with pytest.raises(UserError, match=r"checkpoint.*is not a file of PyTorch, or is cut off"):
         run(replace(config, resume=True))
     assert [file.name for file in folder_of(config).iterdir()] == ["checkpoint.pt"]
 

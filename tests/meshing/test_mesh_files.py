@@ -51,7 +51,10 @@ def test_independent_readers_read_back(tmp_path, suffix, colors, normals):
 
     again = read_mesh(path)
     np.testing.assert_array_equal(again.faces, mesh.faces)
+    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=1e-6)
     assert (again.colors is not None) == colors
+    if colors:
+        assert np.abs(again.colors.astype(int) - mesh.colors).max() <= (suffix == "obj")  # written with four decimals
 
 
 def test_nothing_half_written(tmp_path, monkeypatch):
@@ -84,3 +87,9 @@ def test_messages(tmp_path):
     (tmp_path / "broken.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproper")
     with pytest.raises(UserError, match="cannot be read"):
         read_mesh(tmp_path / "broken.ply")
+    (tmp_path / "far.obj").write_text("v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(UserError, match="NaN or infinity among its vertices"):
+        read_mesh(tmp_path / "far.obj")
+    (tmp_path / "mesh.stl").touch()
+    with pytest.raises(UserError, match=r"wanted a file ending in \.ply or \.obj"):
+        read_mesh(tmp_path / "mesh.stl")

@@ -94,9 +94,10 @@ def bad_files(folder):
     (folder / "raw.pt").write_bytes(pickle.dumps(Bomb()))
     whole = (folder / "hollow.pt").read_bytes()
     (folder / "cut.pt").write_bytes(whole[: len(whole) // 2])
-    damaged = "truncated or is not a file of snarf"
+    damaged = "is not a file of PyTorch, or is cut off"
     return {
-        "missing": "no avatar at", "empty": damaged, "text": damaged, "cut": damaged, "bomb": damaged, "raw": damaged,
+        "missing": "no avatar at", "empty": damaged, "text": damaged, "cut": damaged, "raw": damaged,
+        "bomb": "asks for __builtin__.exec, which plain data does not need; nothing was executed",
         "hollow": "does not describe an avatar of this version", "newer": "wanted format version 1, got 99",
         "list": "is not a snarf avatar", "other": "is not a snarf avatar",
     }  # fmt: skip

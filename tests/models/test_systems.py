@@ -285,11 +285,11 @@ def test_points_of_bones_see_the_joints_of_their_bone(store):
 
 
 SPOILT_TEMPLATES = {
-    "template.vertices: wanted shape .V, 3., got .3.": {"vertices": torch.zeros(3)},
+    "template.vertices: wanted shape .any, 3., got .3.": {"vertices": torch.zeros(3)},
     "template.vertices: wanted finite numbers": {"vertices": torch.full((4, 3), torch.nan)},
-    "template.vertices: wanted finite numbers of dtype torch.float32": {"vertices": torch.zeros(4, 3, dtype=torch.int32)},
-    "template.weights: wanted shape .V, 2., got .4, 7.": {"weights": torch.zeros(4, 7)},
-    "template.weights: wanted shape .V, 2., got str": {"weights": "ones"},
+    "template.vertices: wanted dtype torch.float32, got torch.int32": {"vertices": torch.zeros(4, 3, dtype=torch.int32)},
+    "template.weights: wanted shape .any, 2., got .4, 7.": {"weights": torch.zeros(4, 7)},
+    "template.weights: wanted shape .any, 2., got str": {"weights": "ones"},
     "template: 4 vertices, but weights for 5": {"weights": torch.ones(5, 2)},
 }
 

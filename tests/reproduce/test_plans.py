@@ -8,6 +8,7 @@ from fake_runs import fake_plan, fake_samples
 from snarfcli.commands.preprocess import PreprocessConfig
 from snarfcli.commands.reproduce import resolve_training
 from snarfcli.commands.train import TrainConfig
+from snarfcli.descriptions import read_described
 from snarfcli.errors import UserError
 from snarfcli.hydra_config.overrides import check_overrides
 from snarfcli.reproduce.experiments import EXPERIMENTS
@@ -103,7 +104,7 @@ def test_jobs_survive_being_written_down(tmp_path):
     from dataclasses import asdict
 
     for job in fake_plan(tmp_path, "ablations").jobs:
-        assert Job.from_dict(json.loads(json.dumps(asdict(job)))) == job
+        assert read_described(Job, json.loads(json.dumps(asdict(job))), "job") == job
 
 
 def test_all_runs_what_experiments_share_once(tmp_path):

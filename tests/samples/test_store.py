@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError
 from snarfcli.samples.layout import FORMAT_VERSION, samples_folder
 from snarfcli.samples.sequence import SequenceSamples
@@ -145,7 +148,8 @@ def test_the_rest_comes_back(folder: Path) -> None:
 
 
 def test_scans_with_faces_of_their_own_take_no_memory(tmp_path: Path) -> None:
-    frames, made, faces = 30, _frame(0), np.zeros((20_000, 3), np.int32)
+    frames, faces = 30, np.zeros((20_000, 3), np.int32)
+    made = replace(_frame(0), vertices=np.zeros(frames, np.uint64))
     writer = SequenceWriter(tmp_path / "scans", frames, _POINTS)
     tracemalloc.start()
     try:
@@ -210,11 +214,11 @@ def test_unknown_and_empty_splits(folder: Path) -> None:
         store.sequences("trian")
 
 
-@pytest.mark.parametrize("version", [0, FORMAT_VERSION + 1, None])
-def test_another_format_version_is_refused(folder: Path, version: int | None) -> None:
+@pytest.mark.parametrize(("version", "told"), [(0, "0"), (FORMAT_VERSION + 1, "3"), (None, "none"), ("${x}", "none")])
+def test_another_format_version_is_refused(folder: Path, version: int | str | None, told: str) -> None:
     path = folder / "manifest.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": version}))
-    with pytest.raises(UserError, match=rf"wanted format version {FORMAT_VERSION}, got {version};.*overwrite=true"):
+    with pytest.raises(UserError, match=rf"wanted format version {FORMAT_VERSION}, got {told};.*overwrite=true"):
         _open(folder)
     with pytest.raises(UserError, match="format"):
         require_same_settings(folder, _SETTINGS)
@@ -231,7 +235,7 @@ def test_damage_is_named(folder: Path, name: str) -> None:
     with pytest.raises(UserError, match=f"damaged: .*{name} is missing"):
         _open(folder)
     path.write_bytes(content[:-40] + bytes(1) * 40)
-    with pytest.raises(UserError, match=f"{name}.*(cannot be read|checksum differs)"):
+    with pytest.raises(UserError, match=f"{name}.*(is not an .npz archive|is damaged|checksum differs)"):
         _open(folder).verify()
     path.write_bytes(content)
     _open(folder).verify()
@@ -261,3 +265,57 @@ def test_discarding_spares_what_is_not_ours(folder: Path) -> None:
     (folder / "notes.txt").write_text("mine")
     discard_samples(folder)
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EMFILE, errno.EIO])
+@pytest.mark.parametrize("name", ["frames.npz", "points.npy"])
+def test_errors_of_the_system_are_not_damage(folder: Path, number: int, name: str, monkeypatch) -> None:
+    def failing(path: Path, *arguments, **more):
+        if path.name == name:
+            raise OSError(number, os.strerror(number), str(path))
+        return opened(path, *arguments, **more)
+
+    opened = Path.open
+    monkeypatch.setattr(Path, "open", failing)
+    with pytest.raises(OSError, match=os.strerror(number)) as caught:
+        _open(folder)
+    assert name in caught.value.filename
+    message = user_message(caught.value)
+    assert "delete" not in message
+    assert "overwrite" not in message
+
+
+def test_frames_in_another_order_are_damage(folder: Path) -> None:
+    path = folder / "test" / "hop" / "frames.npz"
+    arrays = dict(np.load(path))
+    arrays["frame_numbers"] = arrays["frame_numbers"][::-1].copy()
+    write_arrays(path, arrays)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for sequence in manifest["sequences"]:
+        if sequence["name"] == "hop":
+            sequence["files"]["frames.npz"]["bytes"] = path.stat().st_size
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=r"the samples are damaged: .*frames\.npz: frame_numbers: wanted rising numbers"):
+        _open(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m["sequences"][0].update(name="../../../etc"), r"sequences\[0\]\.name: wanted the name of a folder"),
+        (lambda m: m["sequences"][0].update(split="all"), r"sequences\[0\]\.split: wanted one of train, test, ood"),
+        (lambda m: m["sequences"][0].update(frames=-1), r"sequences\[0\]: wanted frames of a multiple of 8 points"),
+        (lambda m: m["sequences"][0].update(frame_rate="fast"), r"sequences\[0\]\.frame_rate: wanted a number, got 'fast'"),
+        (lambda m: m["sequences"].append(m["sequences"][0]), "wanted different sequences, at least one"),
+        (lambda m: m["files"].update({"../x": m["files"]["subject.npz"]}), r"files: wanted subject\.npz, got other names"),
+        (lambda m: m.update(subject="\x1b[2J"), r"subject: wanted a short printable name"),
+        (lambda m: m.pop("sequences"), r"sequences: wanted a value, got none"),
+    ],
+)
+def test_a_damaged_manifest_is_named(folder: Path, change, message: str) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(UserError, match=f"are damaged: .*{message}") as caught:
+        _open(folder)
+    assert str(caught.value).isprintable()

@@ -30,10 +30,11 @@ import torch
 from common import print_table, require
 from torch import Tensor
 
+from snarfcli.array_files import read_npz
 from snarfcli.bodies import Skeleton, axis_angle_to_matrix, invert_rigid, matrix_to_axis_angle
 from snarfcli.bodies.kinematics import nearest_rotation
 from snarfcli.datasets.splits import SPLITS
-from snarfcli.files import read_json, read_npz, write_arrays, write_json
+from snarfcli.files import read_json, write_arrays, write_json
 from snarfcli.samples.layout import read_arrays, samples_folder
 from snarfcli.samples.store import SampleStore
 from snarfcli.samples.writing import describe_files

@@ -28,7 +28,7 @@ def _target(make: Callable[[], Target]) -> Callable[[], Target]:
 def npz() -> Target:
     import io
 
-    from snarfcli.files import read_npz
+    from snarfcli.array_files import read_npz
 
     def seeds() -> list[bytes]:
         made = []

@@ -12,20 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from snarfcli import files
+from snarfcli import array_files
+from snarfcli.array_files import list_npz, map_npy, read_npy, read_npz
 from snarfcli.cli.messages import user_message
 from snarfcli.errors import UserError
-from snarfcli.files import (
-    atomic_path,
-    list_npz,
-    map_npy,
-    read_json,
-    read_npy,
-    read_npz,
-    remove_temporaries,
-    write_json,
-    write_tensors,
-)
+from snarfcli.files import atomic_path, read_json, remove_temporaries, write_json, write_tensors
 from snarfcli.formats.torch_files import read_plain_torch, read_torch
 
 
@@ -283,7 +274,7 @@ def test_errors_of_the_system_are_not_damage(number, tmp_path, monkeypatch):
 
 def test_too_little_memory_is_not_damage(tmp_path, monkeypatch):
     np.savez(tmp_path / "a.npz", x=np.arange(3))
-    monkeypatch.setattr(files, "_read_array", lambda *_: bytearray(2**62))
+    monkeypatch.setattr(array_files, "_read_array", lambda *_: bytearray(2**62))
     with pytest.raises(MemoryError, match=r"not enough memory to read .*a\.npz; close other programs"):
         read_npz(tmp_path / "a.npz")
 

@@ -25,9 +25,9 @@ LAYERS = (
     ("bodies", "deformer", "shape"),
     ("networks",),
     (
+        "array_files",
         "checks",
         "descriptions",
-        "files",
         "formats",
         "hydra_config",
         "native",
@@ -38,7 +38,7 @@ LAYERS = (
         "sampling",
         "segments",
     ),
-    ("locks",),
+    ("files", "locks"),
     ("errors", "interrupts", "names", "safe_start", "texts", "versions"),
 )
 """Folders and top-level modules of the package, from the top layer down; those of one layer do not import each other."""

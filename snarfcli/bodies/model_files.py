@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from snarfcli.array_files import read_npz
 from snarfcli.bodies.body import Body
 from snarfcli.bodies.skeleton import MAX_JOINTS, SMPL_JOINT_NAMES, SMPLH_JOINT_NAMES, SMPLX_JOINT_NAMES
 from snarfcli.errors import UserError
-from snarfcli.files import read_npz
 from snarfcli.formats.pickles import read_pickle
 
 __all__ = ["load_body"]

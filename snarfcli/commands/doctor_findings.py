@@ -35,7 +35,7 @@ def promises(data_root: Path, output_root: Path) -> Iterator[Finding]:
     yield from (_locks(root) for root in roots)
     used = [line for root in roots for line in outputs_in_use(root)]
     yield Finding("in use now", "; ".join(used) if used else "nothing")
-    yield Finding("avatars", "of others are read as numbers only, and checked before anything is built; they cannot run code")
+    yield Finding("files of others", "are read as numbers only, and checked before anything is built; they cannot run code")
 
 
 def _locks(root: Path) -> Finding:

@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from snarfcli.array_files import read_npy
 from snarfcli.bodies import Body, find_body, load_body
 from snarfcli.datasets.cape_frames import CapeMeshes, read_cape_frame
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.splits import SPLITS, Split, split_sequences
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData, body_template
 from snarfcli.errors import UserError, nearest
-from snarfcli.files import read_npy
 from snarfcli.formats.pickles import read_pickle
 from snarfcli.motions import Motion
 from snarfcli.names import folder_names

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from snarfcli.array_files import read_npz
 from snarfcli.deformer import CanonicalGrid, PresetWeights
 from snarfcli.errors import UserError
-from snarfcli.files import read_npz
 
 __all__ = ["read_preset_weights"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.array_files import read_npz
 from snarfcli.errors import UserError
-from snarfcli.files import read_npz
 
 __all__ = ["read_shape"]
 

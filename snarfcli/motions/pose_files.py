@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli.array_files import list_npz, read_npy, read_npz
 from snarfcli.errors import UserError
-from snarfcli.files import list_npz, read_npy, read_npz
 from snarfcli.formats.pickle_tree import PickleError
 from snarfcli.formats.pickles import estimate_of, read_estimate
 from snarfcli.formats.torch_files import read_torch

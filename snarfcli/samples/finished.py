@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from snarfcli.array_files import read_npz
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
-from snarfcli.files import read_json, read_npz, write_arrays
+from snarfcli.files import read_json, write_arrays
 from snarfcli.samples.frames import frame_arrays, frame_numbers
 from snarfcli.samples.layout import SEQUENCE_FILES
 from snarfcli.samples.manifests import is_sequence

@@ -21,8 +21,9 @@ from typing import Any
 
 import numpy as np
 
+from snarfcli.array_files import map_npy, read_npz
 from snarfcli.errors import UserError
-from snarfcli.files import file_digest, map_npy, read_npz
+from snarfcli.files import file_digest
 
 __all__ = [
     "FORMAT_VERSION",

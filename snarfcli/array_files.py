@@ -1,0 +1,257 @@
+"""Arrays in NumPy's formats from anywhere: nothing in them is executed, and sizes are checked before anything is unpacked."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import zipfile
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, cast
+
+import numpy as np
+
+from snarfcli.errors import UserError, raise_system_error
+from snarfcli.files import check_regular
+from snarfcli.texts import one_line
+
+__all__ = ["MAX_ARRAY_BYTES", "list_npz", "map_npy", "read_npy", "read_npz"]
+
+MAX_ARRAY_BYTES = 2**30
+"""Maximum total size of the arrays in one file, unless a reader sets another."""
+# Deflate compresses at most about 1030 to 1. Arrays of zeros, such as unused hands, come close, but no large file as a whole.
+_BOMB_BYTES = 2**26
+_BOMB_RATIO = 500
+_MAX_HEADER_BYTES = 2**16
+# The header is a Python dict with three entries; records have a list instead of a word as type.
+_HEADER = (r"'descr':\s*'([^']*)'", r"'fortran_order':\s*(True|False)", r"'shape':\s*\(([\d\sL,]*)\)")
+
+
+def read_npz(
+    path: str | Path,
+    what: str = "file",
+    *,
+    only: Collection[str] | None = None,
+    max_bytes: int = MAX_ARRAY_BYTES,
+    objects: Callable[[bytes], Any] | None = None,
+) -> dict[str, np.ndarray]:
+    """Read the arrays of an `.npz` file. Nothing is unpickled; members that are not arrays are left out.
+
+    Sizes are checked before anything is unpacked.
+
+    Args:
+        path: file.
+        what: the kind of file, for messages.
+        only: names of the arrays to read, or None for all. Members that are not read are not checked.
+        max_bytes: maximum total size of the arrays.
+        objects: returns the content of a pickle without executing it, for arrays of objects; without it, these are rejected.
+
+    Raises:
+        UserError: the file is missing, is not a zip archive, is truncated, damaged, encrypted, too large or a zip bomb; an
+            array occurs twice, or holds pickled objects or records.
+        OSError, MemoryError: the system cannot read it.
+    """
+    path = Path(path)
+    check_regular(path, what, "an .npz")
+    try:
+        with path.open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise UserError(f"{what} {path} is not an .npz archive, or is truncated; copy or download it again")
+            with zipfile.ZipFile(file) as archive:
+                members = _members(archive, f"{what} {path}", only, max_bytes)
+                arrays = {}
+                for name, member in members.items():
+                    with archive.open(member) as stream:
+                        subject = f"{what} {path}: {name!r:.60}"
+                        array = _read_array(cast(io.BufferedIOBase, stream), member.file_size, subject, objects)
+                    if array is not None:
+                        arrays[name] = array
+                return arrays
+    except UserError:
+        raise
+    except Exception as error:  # zipfile raises many kinds; tests/fuzz_targets.py found over ten
+        raise_system_error(error, path)
+        raise UserError(f"{what} {path} is damaged ({one_line(error, 200)}); copy or download it again") from None
+
+
+def list_npz(path: str | Path, what: str = "file") -> tuple[str, ...]:
+    """Return the names of the arrays of an `.npz` file, without reading them.
+
+    Raises:
+        UserError: the file is missing, or is not a zip archive.
+        OSError: the system cannot read it.
+    """
+    path = Path(path)
+    check_regular(path, what, "an .npz")
+    try:
+        with path.open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise UserError(f"{what} {path} is not an .npz archive, or is truncated; copy or download it again")
+            with zipfile.ZipFile(file) as archive:
+                return tuple(member.filename.removesuffix(".npy") for member in archive.infolist() if not member.is_dir())
+    except UserError:
+        raise
+    except Exception as error:  # zipfile raises many kinds
+        raise_system_error(error, path)
+        raise UserError(f"{what} {path} is damaged ({one_line(error, 200)}); copy or download it again") from None
+
+
+def read_npy(
+    path: str | Path, what: str = "file", *, max_bytes: int = MAX_ARRAY_BYTES, objects: Callable[[bytes], Any] | None = None
+) -> np.ndarray:
+    """Read the array of an `.npy` file. Nothing is unpickled; the size is checked first.
+
+    Args:
+        path: file.
+        what: the kind of file, for messages.
+        max_bytes: maximum size of the file.
+        objects: see `read_npz`.
+
+    Raises:
+        UserError: the file is missing, is not an `.npy` file, is truncated, too large, or holds pickled objects or records.
+        OSError, MemoryError: the system cannot read it.
+    """
+    path = Path(path)
+    check_regular(path, what, "an .npy")
+    try:
+        size = path.stat().st_size
+        if size > max_bytes:
+            raise UserError(f"{what} {path} has {size / 2**20:,.0f} MiB, wanted at most {max_bytes / 2**20:,.0f}; split it")
+        with path.open("rb") as file:
+            array = _read_array(file, size, f"{what} {path}", objects)
+    except OSError as error:
+        raise_system_error(error, path)
+        raise UserError(f"{what} {path} is damaged ({one_line(error, 200)}); copy or download it again") from None
+    if array is None:
+        raise UserError(f"{what} {path} is not an .npy file, or is truncated; copy or download it again")
+    return array
+
+
+def map_npy(path: str | Path, shape: tuple[int, ...], dtype: type, what: str = "file") -> np.ndarray:
+    """Memory-map the array of an `.npy` file.
+
+    Raises:
+        UserError: the file is missing, damaged, or its array has another shape or type.
+        OSError: the system cannot read it.
+    """
+    path = Path(path)
+    check_regular(path, what, "an .npy")
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = _read_header(file, size, f"{what} {path}")
+    wanted = (np.dtype(dtype), "C", shape)
+    if head is None or head.offset + head.dtype.itemsize * math.prod(head.shape) != size:
+        raise UserError(f"{what} {path} is not an .npy file, or is truncated")
+    if head[:3] != wanted:
+        raise UserError(f"{what} {path}: wanted {wanted[0]} {list(shape)}, got {head.dtype} {list(head.shape)[:9]}")
+    if not math.prod(shape):
+        return np.zeros(shape, dtype)
+    return np.memmap(path, dtype, "r", head.offset, shape)
+
+
+def _members(
+    archive: zipfile.ZipFile, subject: str, only: Collection[str] | None, max_bytes: int
+) -> dict[str, zipfile.ZipInfo]:
+    """Return the members to read by name, after checks of their sizes and compression."""
+    members: dict[str, zipfile.ZipInfo] = {}
+    for member in archive.infolist():
+        name = member.filename.removesuffix(".npy")
+        if member.is_dir() or (only is not None and name not in only):
+            continue
+        if name in members:
+            raise UserError(f"{subject} contains {name!r:.60} twice; save it again")
+        if member.flag_bits & 1:
+            raise UserError(f"{subject} is damaged or encrypted; copy or download it again")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise UserError(f"{subject} uses an unsupported compression; save it again with numpy.savez_compressed")
+        members[name] = member
+    total, packed = (sum(getattr(member, size) for member in members.values()) for size in ("file_size", "compress_size"))
+    if total > max_bytes:
+        raise UserError(f"{subject} unpacks to {total / 2**20:,.0f} MiB, wanted at most {max_bytes / 2**20:,.0f}; split it")
+    if total > _BOMB_BYTES and total > _BOMB_RATIO * packed:
+        raise UserError(
+            f"{subject} unpacks to {total / 2**20:,.0f} MiB from {packed / 2**10:,.0f} KiB, which no real data does"
+        )
+    return members
+
+
+def _read_array(
+    stream: io.BufferedIOBase, size: int, subject: str, objects: Callable[[bytes], Any] | None
+) -> np.ndarray | None:
+    """Read one array in NumPy's `.npy` format, `size` bytes in total; return None for another format.
+
+    NumPy's own reader trusts any length in the header, and evaluates the header as Python.
+    """
+    damaged = UserError(f"{subject} is damaged; copy or download the file again")
+    head = _read_header(stream, size, subject)
+    if head is None:
+        return None
+    if head.dtype.hasobject and objects is not None:
+        return _boxed(objects(stream.read(size)))
+    if head.dtype.hasobject:
+        raise UserError(f"{subject} holds pickled objects, which are never executed; save plain arrays")
+    count = math.prod(head.shape)
+    if count * head.dtype.itemsize != size - head.offset or (head.dtype.itemsize == 0 and count > 1):
+        raise damaged
+    content = bytearray(count * head.dtype.itemsize)
+    filled, view = 0, memoryview(content)
+    while filled < len(content):
+        got = stream.readinto(view[filled : filled + 2**20])
+        if not got:
+            raise damaged
+        filled += got
+    if stream.read(1):  # at the end of a member, zipfile compares the checksum
+        raise damaged
+    try:
+        flat = np.frombuffer(content, head.dtype, count) if content else np.zeros(count, head.dtype)
+        return flat.reshape(head.shape, order=head.order)
+    except (ValueError, TypeError):  # such as too many dimensions
+        raise damaged from None
+
+
+class _Header(NamedTuple):
+    """The header of an array."""
+
+    dtype: np.dtype
+    order: Literal["C", "F"]
+    shape: tuple[int, ...]
+    offset: int
+    """Number of bytes before the values."""
+
+
+def _read_header(stream: io.BufferedIOBase, size: int, subject: str) -> _Header | None:
+    """Read the header of an array of `size` bytes in NumPy's `.npy` format; return None for another format."""
+    damaged = UserError(f"{subject} is damaged; copy or download the file again")
+    magic = stream.read(8)
+    if magic[:6] != b"\x93NUMPY":
+        return None
+    if len(magic) < 8 or magic[6] not in (1, 2, 3):
+        raise damaged
+    width = 2 if magic[6] == 1 else 4
+    length = int.from_bytes(stream.read(width), "little")
+    if length > min(_MAX_HEADER_BYTES, size):
+        raise damaged
+    header = stream.read(length).decode("latin1")
+    found = [match for pattern in _HEADER if (match := re.search(pattern, header))]
+    if len(found) < len(_HEADER):
+        if "'descr': [" in header:
+            raise UserError(f"{subject} holds records; save plain arrays")
+        raise damaged
+    descr, order, shape = (match[1] for match in found)
+    try:
+        dtype = np.dtype(descr)
+    except Exception:  # NumPy raises several kinds for a word that is not a type
+        raise damaged from None
+    numbers = [number.rstrip("L") for number in shape.replace(" ", "").split(",") if number]
+    if not dtype.hasobject and any(len(number) > 18 for number in numbers):  # over 2^59
+        raise damaged
+    lengths = () if dtype.hasobject else tuple(int(number) for number in numbers)
+    return _Header(dtype, "F" if order == "True" else "C", lengths, 8 + width + length)
+
+
+def _boxed(value: Any) -> np.ndarray:
+    """Return any value as an array of objects without axes."""
+    box = np.empty((), object)
+    box[()] = value
+    return box

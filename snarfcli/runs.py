@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import random
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,9 @@ def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str |
     if not (folder / "avatar.pt").is_file():
         trained = sorted(p.parent.name for p in folder.parent.glob("*/avatar.pt"))
         hint = f"; trained runs there: {', '.join(trained)}{nearest(run, trained)}" if trained else ""
-        chosen = f"subject={subject}" if data == "builtin" else f"data={data} subject={subject}"
+        settings = {"data": data, "subject": subject, "output_root": output_root, "run": run}
+        usual = {"data": "builtin", "output_root": "outputs", "run": "fast_snarf"}
+        chosen = " ".join(shlex.quote(f"{name}={value}") for name, value in settings.items() if value != usual.get(name))
         raise UserError(f'no avatar in {folder}{hint}; run "snarf train {chosen}" or give ckpt=PATH')
     return folder / "avatar.pt"
 

@@ -41,6 +41,6 @@ def test_the_next_step_is_named(folders, tmp_path, capsys):
     assert main(["train", *folders, output]) == 2
     assert 'run "snarf preprocess data=meshes subject=rex' in capsys.readouterr().err
     assert main(["animate", *folders, output]) == 2
-    assert 'run "snarf train data=meshes subject=rex"' in capsys.readouterr().err
+    assert 'run "snarf train data=meshes subject=rex' in capsys.readouterr().err
     assert main(["doctor", "data.folder=x"]) == 2
     assert "data.folder: wanted a choice of data too" in capsys.readouterr().err

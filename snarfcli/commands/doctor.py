@@ -19,6 +19,7 @@ from omegaconf import MISSING
 import snarfcli
 from snarfcli.commands.doctor_findings import Finding, promises
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.errors import UserError
 from snarfcli.parallel import count_cores
 from snarfcli.texts import one_line
 from snarfcli.versions import RECORDED_PACKAGES, installed_version
@@ -31,6 +32,8 @@ _SUBJECTS_CHECKED = 3  # of a data set; each takes some seconds
 _LISTED = 8  # names of data or runs on one line
 _TOOLS = {"embreex": "embreex.rtcore_scene", "libigl": "igl", "pymeshlab": "pymeshlab"}
 """Compiled packages that are imported to see whether they work, and the module that shows it."""
+_OF_MOTIONS = {"up": "auto", "hands": "rest", "rest": "auto", "mapping": None, "clip": None}
+"""Settings that need a motion file, and their defaults."""
 _OTHER_PACKAGES = ("scipy", "hydra-core", "tensorboard")
 
 
@@ -69,9 +72,15 @@ def run(config: DoctorConfig) -> int:
 
     Returns:
         0, also if fallbacks are in use; 2 if the data set to check cannot be used.
+
+    Raises:
+        UserError: a setting for motion files is given without one.
     """
     if config.pose is not None:
         return _check_pose(config, config.pose)
+    for name, usual in _OF_MOTIONS.items():
+        if getattr(config, name) != usual:
+            raise UserError(f"{name}: wanted a motion file to use it with, got none; add --pose FILE")
     if config.data is not None:
         return _check_data(config, config.data)
     sections: dict[str, Callable[[], Iterator[Finding]]] = {

@@ -342,7 +342,7 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
         ({"pose": None, "motion": "jumping_jaks"}, "did you mean 'jumping_jacks'"),
         ({"pose": "nowhere.npz"}, "no pose file at nowhere.npz"),
         ({"subject": "50003"}, "no built-in subject '50003'"),
-        ({"subject": "50004"}, 'no avatar in .*50004.*; run "snarf train subject=50004" or give ckpt=PATH'),
+        ({"subject": "50004"}, 'no avatar in .*50004.*; run "snarf train subject=50004 output_root=.*" or give ckpt=PATH'),
         ({"ckpt": "nowhere.pt"}, "no avatar at nowhere.pt"),
     ],
     ids=lambda value: ",".join(value) if isinstance(value, dict) else "",

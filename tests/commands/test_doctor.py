@@ -87,3 +87,12 @@ def test_as_a_command(capsys, tmp_path, monkeypatch):
     assert cli.main(["doctor", "data_root=elsewhere"]) == 0
     assert cli.main(["doctor", "data_rot=x"]) == 2
     assert "did you mean 'data_root'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("setting", ["up=y", "hands=released", "rest=file", "mapping=m.json", "clip=walk"])
+def test_settings_of_motions_need_one(capsys, setting):
+    assert cli.main(["doctor", setting]) == 2
+    assert (
+        f"{setting.partition('=')[0]}: wanted a motion file to use it with, got none; add --pose FILE"
+        in capsys.readouterr().err
+    )

@@ -140,7 +140,9 @@ def test_results_go_beside_a_given_checkpoint(config, store, tmp_path, caplog):
 
 def test_no_avatar_names_the_command_that_makes_one(config):
     (folder_of(config) / "avatar.pt").unlink()
-    with pytest.raises(UserError, match=r'no avatar in .*fast_snarf; run "snarf train subject=toy" or give ckpt=PATH'):
+    with pytest.raises(
+        UserError, match=r'no avatar in .*fast_snarf; run "snarf train subject=toy output_root=.*" or give ckpt=PATH'
+    ):
         run(config)
 
 

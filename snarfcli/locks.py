@@ -35,6 +35,7 @@ __all__ = [
     "inherited_locks",
     "lock_file",
     "locked",
+    "may_be_in_use",
     "one_of",
     "outputs_in_use",
     "try_lock",
@@ -95,6 +96,12 @@ def clear_killed(output: str | Path) -> None:
 def holder_is_gone(output: Path) -> bool:
     """Return whether the process that held the lock of an output has been killed; False if that cannot be known."""
     return _is_gone(_read(_about(output)))
+
+
+def may_be_in_use(output: Path) -> bool:
+    """Return whether an output whose lock is free may have a holder: where locks do not work, or not between machines."""
+    holder = _read(_about(output))
+    return os.name == "posix" and holder is not None and not _is_gone(holder)
 
 
 def outputs_in_use(folder: Path) -> list[str]:

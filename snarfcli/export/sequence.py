@@ -143,4 +143,5 @@ def write_sequence(
                 skipped.append((name, frame, str(error)))
                 continue
             MESH_WRITERS[suffix](place / f"frame_{frame:06d}.{suffix}", replace(mesh, colors=colors))
+        flush_to_disk(place)
     return skipped

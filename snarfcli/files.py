@@ -37,11 +37,16 @@ _MAX_JSON_BYTES = 2**25  # about 600 MiB when parsed
 
 
 @contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
+def atomic_path(path: str | Path, *, flush_name: bool = True) -> Iterator[Path]:
     """Yield a temporary path in the folder of `path`; it replaces `path` if the block succeeds and is deleted if it fails.
 
     Parent folders are created. The temporary name keeps the suffix, by which many writers choose the format. The content is
     on the disk before the name changes, so that a power cut leaves the old file or the new one.
+
+    Args:
+        path: the file.
+        flush_name: wait until the new name is on the disk too; half of the time for small files. Not needed for files of a
+            series, if something is written at its end that waits for the names in the folder.
 
     Raises:
         OSError: the file cannot be written. It names `path`, also for a full disk, where the system names no file.
@@ -53,7 +58,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         flush_to_disk(temporary)
         os.replace(temporary, path)
-        flush_to_disk(path.parent)
+        if flush_name:
+            flush_to_disk(path.parent)
     except OSError as error:
         if error.errno is not None and error.filename in (None, str(temporary)):
             error.filename = str(path)

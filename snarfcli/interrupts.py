@@ -94,10 +94,14 @@ def interrupts_noted(on_first: Callable[[], None]) -> Iterator[Noted]:
 
 @contextlib.contextmanager
 def _handled(handle: Callable[[int, Any], None], numbers: tuple[int, ...]) -> Iterator[None]:
-    """Handle signals in the main thread, the only one that gets them; signals that are ignored stay so."""
+    """Handle signals in the main thread, the only one that gets them.
+
+    Signals that are ignored stay so, and those that native code handles, whose handlers Python could not bring back.
+    """
     before = {}
     if threading.current_thread() is threading.main_thread():
-        before = {number: signal.getsignal(number) for number in numbers if signal.getsignal(number) is not signal.SIG_IGN}
+        before = {number: signal.getsignal(number) for number in numbers}
+        before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
     for number in before:
         signal.signal(number, handle)
     try:

@@ -1,8 +1,9 @@
 """Locks between processes: one output folder has one writer at a time, and its child processes count as the writer too.
 
 DESIGN. A lock is a hidden file beside the folder (not in it: folders are replaced as a whole), locked by the system, so that it
-is free as soon as its holder has ended, however it ended. Child processes inherit the lock: when the holder is killed, the lock
-stays until its children, which may still write, have ended too. A second file says who holds the lock. It only serves messages.
+is free as soon as its holder has ended, however it ended. It is in the folder only where nothing can be written beside it.
+Child processes inherit the lock: when the holder is killed, the lock stays until its children, which may still write, have
+ended too. A second file says who holds the lock. It only serves messages.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ __all__ = [
     "inherited_locks",
     "lock_file",
     "locked",
+    "may_be_in_use",
     "one_of",
     "outputs_in_use",
     "try_lock",
@@ -47,6 +49,8 @@ _TELL_EVERY_S = 60.0
 _PATIENCE_S = 20.0
 # What file systems without locks answer, such as Lustre, NFS and shared folders mounted without them.
 _NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
+_LOCK, _ABOUT = ".lock", ".holder.json"
+_INSIDE = "snarf-folder"
 _held: set[int] = set()
 
 
@@ -94,16 +98,26 @@ def holder_is_gone(output: Path) -> bool:
     return _is_gone(_read(_about(output)))
 
 
+def may_be_in_use(output: Path) -> bool:
+    """Return whether an output whose lock is free may have a holder: where locks do not work, or not between machines."""
+    holder = _read(_about(output))
+    return os.name == "posix" and holder is not None and not _is_gone(holder)
+
+
 def outputs_in_use(folder: Path) -> list[str]:
-    """Return one line for each output below a folder that a process holds: which one, by whom and since when."""
+    """Return one line for each output below a folder that a process holds: which one, by whom and since when.
+
+    Outputs of other users, whose locks may not be opened, are left out.
+    """
     lines = []
-    for path in sorted(folder.rglob(".*.lock")):
-        release = try_lock(path)
-        if release is None:
-            output = path.with_name(path.name[1:].removesuffix(".lock"))
-            lines.append(f"{output} {_described(_read(_about(output)))}")
-        else:
-            release()
+    for about in sorted(folder.rglob(f".*{_ABOUT}")):
+        output = _output(about, _ABOUT)
+        with suppress(OSError):
+            release = try_lock(lock_file(output))
+            if release is None:
+                lines.append(f"{output} {_described(_read(about))}")
+            else:
+                release()
     return lines
 
 
@@ -130,10 +144,10 @@ def hold_all_inside(folder: Path) -> Iterator[None]:
         UserError: another process holds one.
     """
     with ExitStack() as held:
-        for path in sorted(folder.rglob(".*.lock")):
+        for path in sorted(folder.rglob(f".*{_LOCK}")):
             release = try_lock(path)
             if release is None:
-                output = path.with_name(path.name[1:].removesuffix(".lock"))
+                output = _output(path, _LOCK)
                 holder = _described(_read(_about(output)))
                 raise UserError(f"{output} is in use {holder}; wait until it ends, or give another folder, or end it")
             held.callback(release)
@@ -142,12 +156,28 @@ def hold_all_inside(folder: Path) -> Iterator[None]:
 
 def lock_file(output: Path) -> Path:
     """Return the file whose lock `hold_output` holds."""
-    return output.with_name(f".{output.name}.lock")
+    return _beside(output, _LOCK)
 
 
 def _about(output: Path) -> Path:
     """Return the file that says who holds the lock of an output."""
-    return output.with_name(f".{output.name}.holder.json")
+    return _beside(output, _ABOUT)
+
+
+def _beside(output: Path, ending: str) -> Path:
+    """Return a hidden file beside an output; in it, if it is the folder of a disk or in a folder that is read-only.
+
+    In a container, only the disk is shared with other containers, and often only the disk can be written to.
+    """
+    if output.is_dir() and (os.path.ismount(output) or not os.access(output.parent, os.W_OK)):
+        return output / f".{_INSIDE}{ending}"
+    return output.with_name(f".{output.name}{ending}")
+
+
+def _output(path: Path, ending: str) -> Path:
+    """Return the output of a file that `_beside` has returned."""
+    name = path.name[1:].removesuffix(ending)
+    return path.parent if name == _INSIDE else path.with_name(name)
 
 
 def _await(path: Path, about: Path, output: Path, wait: bool) -> Callable[[], None]:

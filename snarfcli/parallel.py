@@ -77,7 +77,7 @@ class Worker:
 
     The process ignores the signals that ask the whole group to end; the parent process ends it. It also ends when the parent
     is killed, and until then keeps the locks that the parent held (see `locks`). When it is ahead of the receiver, it waits
-    as soon as the pipe is full (64 kB on Linux).
+    as soon as the pipe is full (0.2 MB on Linux).
     """
 
     def __init__(
@@ -95,15 +95,22 @@ class Worker:
             task: its arguments, picklable.
             fewer: the setting that asks for fewer workers, for the message when memory runs out.
             has_requests: whether the function gets one more argument, an iterator over what is passed to `send`.
+
+        Raises:
+            UserError: the process has ended at once, for example because the system killed it when memory ran out.
         """
         context = multiprocessing.get_context("spawn")
-        self.connection, theirs = context.Pipe(duplex=has_requests)
+        self.connection, theirs = context.Pipe()
         work = pickle.dumps((function, task))  # here, so that a failure to read it there is reported like any other
-        self._process = context.Process(target=_serve, args=(theirs, work, has_requests, _Locks()), daemon=True)
+        self._process = context.Process(target=_serve, args=(theirs, has_requests, _Locks()), daemon=True)
         self._fewer = fewer
         with _one_thread(), safe_imports():
             self._process.start()
         theirs.close()
+        try:  # not among the arguments: `start` would wait for ever for a process that has ended before it has read them
+            self.connection.send_bytes(work)
+        except OSError:
+            raise self._lost() from None
 
     def send(self, request: Any) -> None:
         """Send a request to a function that takes requests.
@@ -218,14 +225,14 @@ class _Locks:
         return [descriptor.detach() for descriptor in sent]
 
 
-def _serve(connection: Connection, work: bytes, has_requests: bool, locks: Any) -> None:
+def _serve(connection: Connection, has_requests: bool, locks: Any) -> None:
     """Run one task in the worker and send each item; the parent decides what a failure means."""
     for number in SIGNALS:  # they reach the whole group; the parent ends the workers
         with contextlib.suppress(ValueError):
             signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        function, task = pickle.loads(work)
+        function, task = pickle.loads(connection.recv_bytes())
         for item in function(*task, *([_requests(connection)] if has_requests else [])):
             connection.send(("item", item))
         connection.send(("done", None))

@@ -56,6 +56,10 @@ def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path: Path, monkeypatc
     write_json(tmp_path / "a.json", 1)
     assert done[:2] == ["flush file", "rename"]
     assert done[2:] == (["flush folder"] if os.name == "posix" else [])
+    done.clear()
+    with atomic_path(tmp_path / "frame_000000.ply", flush_name=False) as temporary:
+        temporary.touch()
+    assert done == ["flush file", "rename"]
 
 
 def test_what_killed_processes_leave_is_known_by_its_name(tmp_path: Path) -> None:

@@ -36,6 +36,13 @@ def test_ignored_signals_stay_ignored() -> None:
     assert not noted
 
 
+def test_signals_that_native_code_handles_stay_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    handler = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with signals_as_interrupts():
+        assert signal.signal(signal.SIGTERM, signal.SIG_DFL) is handler
+
+
 def test_a_second_ctrl_c_raises_and_other_second_requests_do_not() -> None:
     told: list[int] = []
     with interrupts_noted(lambda: told.append(1)) as noted:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from snarfcli.errors import UserError
-from snarfcli.locks import hold_all_inside, hold_output, holder_is_gone, locked, one_of, try_lock
+from snarfcli.locks import hold_all_inside, hold_output, holder_is_gone, locked, one_of, outputs_in_use, try_lock
 
 
 class Stop(Exception):
@@ -121,6 +121,32 @@ def test_the_second_writer_waits_if_it_is_told_to(tmp_path: Path, caplog: pytest
     thread.join()
     assert events == ["first", "second"]
     assert "waiting: " in caplog.text
+
+
+def test_a_folder_beside_which_nothing_can_be_written_has_its_lock_inside(tmp_path: Path, monkeypatch) -> None:
+    disk, other = tmp_path / "disk", tmp_path / "other"
+    disk.mkdir()
+    other.mkdir()
+    is_mount, access = os.path.ismount, os.access
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == disk or is_mount(path))
+    for output in (disk, other):
+        with hold_output(output, "snarf animate"):
+            assert len(list(output.iterdir())) == (2 if output == disk else 0)
+            with pytest.raises(UserError, match=f"{output} is in use by snarf animate"), hold_output(output, "snarf animate"):
+                pass
+            [line] = outputs_in_use(tmp_path)
+            assert line.startswith(f"{output} by snarf animate (process {os.getpid()}")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path and access(path, mode))
+    with hold_output(other, "snarf animate"):
+        assert len(list(other.iterdir())) == 2
+    assert not [*disk.iterdir(), *other.iterdir()], "nothing is left behind"
+
+
+def test_locks_of_other_programs_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / ".theirs.lock").touch()
+    (tmp_path / ".killed.holder.json").write_text("{}")
+    assert not outputs_in_use(tmp_path)
+    assert (tmp_path / ".theirs.lock").exists()
 
 
 @pytest.mark.parametrize(

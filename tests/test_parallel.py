@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
+import multiprocessing.spawn
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -90,6 +92,25 @@ def _fail_to_load() -> None:
 def test_a_task_that_cannot_be_read_is_reported() -> None:
     with pytest.raises(UserError, match="cannot be read there"):
         list(run_in_processes(_count, [(_Unreadable(), 1)], 1))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a script as the interpreter")
+def test_a_process_that_ends_before_it_has_its_task_is_reported(tmp_path: Path) -> None:
+    ends_at_once = tmp_path / "python"
+    ends_at_once.write_text("#!/bin/sh\nexit 7\n")
+    ends_at_once.chmod(0o700)
+    before = multiprocessing.spawn.get_executable()
+    multiprocessing.spawn.set_executable(str(ends_at_once))
+    try:
+        with pytest.raises(UserError, match=r"ended early \(exit code 7\)"):
+            Worker(_large, (bytes(2**22),))
+    finally:
+        multiprocessing.spawn.set_executable(before)
+
+
+def _large(content: bytes) -> Iterator[int]:
+    """Take a task that is larger than a pipe."""
+    yield len(content)
 
 
 def test_leaving_early_ends_the_workers_and_draws_no_more_tasks() -> None:

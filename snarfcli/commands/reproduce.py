@@ -35,7 +35,9 @@ __all__ = ["ReproduceConfig", "resolve_training", "run"]
 log = logging.getLogger(__name__)
 
 # Settings that do not change the avatar, or only name the run.
-_NOT_OF_THE_AVATAR = ("subject", "seed", "run", "data_root", "output_root", "resume", "overwrite", "device", "threads")
+_NOT_OF_THE_AVATAR = (
+    "subject", "seed", "run", "data_root", "output_root", "resume", "overwrite", "wait", "device", "threads",
+)  # fmt: skip
 
 
 @dataclass

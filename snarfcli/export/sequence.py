@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import secrets
 import shutil
@@ -48,10 +49,11 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
         ) from None
     if place.exists() and not place.is_dir():
         raise UserError(f"{folder}: wanted a folder, got a file; give output=FOLDER")
-    if place.is_dir() and (Path.cwd().is_relative_to(place) or place.is_mount()):
+    is_fixed = place.is_dir() and (os.path.ismount(place) or not os.access(place.parent, os.W_OK))
+    if is_fixed or (place.is_dir() and Path.cwd().is_relative_to(place)):
         raise UserError(
-            f"{folder}: wanted a folder that can be replaced as a whole, got a disk or a parent of the current folder; "
-            "give output=FOLDER in it"
+            f"{folder}: wanted a folder that can be replaced as a whole, got a disk, a folder in a read-only one, or a parent "
+            "of the current folder; give output=FOLDER in it"
         )
     there = [path for path in place.rglob("*") if path.is_symlink() or not path.is_dir()] if place.is_dir() else []
     if there and not overwrite:
@@ -141,4 +143,5 @@ def write_sequence(
                 skipped.append((name, frame, str(error)))
                 continue
             MESH_WRITERS[suffix](place / f"frame_{frame:06d}.{suffix}", replace(mesh, colors=colors))
+        flush_to_disk(place)
     return skipped

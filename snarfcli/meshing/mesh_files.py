@@ -22,7 +22,10 @@ _MAX_BYTES = 2**28
 
 
 def write_ply(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh with its normals and colours as binary little-endian PLY. The file is whole or absent."""
+    """Write a mesh with its normals and colours as binary little-endian PLY.
+
+    The file is whole or absent; a power cut soon afterwards may take it.
+    """
     columns: list[tuple[str, str, str, np.ndarray]] = []  # PLY type, name, numpy type, values
     groups = [("float", "<f4", ("x", "y", "z"), mesh.vertices), ("float", "<f4", ("nx", "ny", "nz"), mesh.normals)]
     groups.append(("uchar", "u1", ("red", "green", "blue"), mesh.colors))
@@ -38,14 +41,14 @@ def write_ply(path: str | Path, mesh: Mesh) -> None:
     header = ["ply", "format binary_little_endian 1.0", "comment made by snarf, metres, y up"]
     header += [f"element vertex {len(rows)}", *(f"property {kind} {name}" for kind, name, _, _ in columns)]
     header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header"]
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
+    with atomic_path(path, flush_name=False) as temporary, temporary.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode())
         file.write(rows.tobytes())
         file.write(triangles.tobytes())
 
 
 def write_obj(path: str | Path, mesh: Mesh) -> None:
-    """Write a mesh as OBJ. The file is whole or absent.
+    """Write a mesh as OBJ. The file is whole or absent; a power cut soon afterwards may take it.
 
     Colours follow the coordinates of a vertex as three numbers from 0 to 1, which Blender, MeshLab and trimesh read.
     """
@@ -62,7 +65,7 @@ def write_obj(path: str | Path, mesh: Mesh) -> None:
     else:
         np.savetxt(text, mesh.normals, fmt="vn %.5f %.5f %.5f")
         np.savetxt(text, faces.repeat(2, axis=1), fmt="f %d//%d %d//%d %d//%d")
-    with atomic_path(path) as temporary:
+    with atomic_path(path, flush_name=False) as temporary:
         temporary.write_text(text.getvalue())
 
 

@@ -12,6 +12,7 @@ import contextlib
 import importlib.util
 import logging
 import os
+import re
 import secrets
 import shutil
 import signal
@@ -27,7 +28,7 @@ from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.interrupts import signals_as_interrupts
-from snarfcli.locks import hold_output, holder_is_gone, inherited_locks, lock_file, one_of, try_lock
+from snarfcli.locks import hold_output, holder_is_gone, inherited_locks, lock_file, may_be_in_use, one_of, try_lock
 from snarfcli.reproduce.jobs import JobStatus, read_job_status, run_job
 from snarfcli.reproduce.plans import Job
 from snarfcli.safe_start import safe_environment, snarf_command
@@ -144,9 +145,10 @@ def _launch(
             while process.poll() is None:
                 look()
                 time.sleep(_LOOK_EVERY_S)
-        except KeyboardInterrupt:
+        except BaseException as reason:
             _stop(process, work)
-            look()
+            if isinstance(reason, KeyboardInterrupt):
+                look()
             raise
     look()
     left = [number for number in range(len(jobs)) if number not in seen or seen[number].state == "running"]
@@ -163,15 +165,18 @@ def _launch(
 
 def _remove_abandoned(folder: Path) -> None:
     """Delete the folders of earlier calls that no process uses any more."""
-    names = {path.name if path.is_dir() else path.name.split(".")[1] for path in folder.iterdir()}
-    for work in sorted(folder / name for name in names):
+    found = [re.fullmatch(r"\.?([0-9a-f]{8})(?:\..*)?", path.name) for path in folder.iterdir()]
+    for work in sorted(folder / name for name in {match[1] for match in found if match}):
         release = try_lock(lock_file(work))
         if release is None:
             continue
-        shutil.rmtree(work, ignore_errors=True)
+        is_abandoned = not may_be_in_use(work)
+        if is_abandoned:
+            shutil.rmtree(work, ignore_errors=True)
         release()
-        for path in folder.glob(f".{work.name}.*"):  # its lock, and who held it
-            path.unlink(missing_ok=True)
+        if is_abandoned:
+            for path in folder.glob(f".{work.name}.*"):  # its lock, and who held it
+                path.unlink(missing_ok=True)
 
 
 def run_planned_job(plan: Path, number: int) -> None:

@@ -15,7 +15,7 @@ class Prefetch:
     """Results number k, k + 1, k + 2 and so on of a function, made by worker processes while the caller continues.
 
     DESIGN. Each of W processes makes every W-th result and sends it through its pipe, so results are received in order without
-    a sorting queue. A process that is ahead blocks on its pipe: at most one large result, or 64 kB of small ones, waits in
+    a sorting queue. A process that is ahead blocks on its pipe: at most one large result, or 0.2 MB of small ones, waits in
     each, which is the only bound on memory. When the caller dies, sending fails and the processes end.
 
     Args:

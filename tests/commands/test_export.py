@@ -171,7 +171,7 @@ def test_folders_that_cannot_be_replaced_are_rejected_at_once(folder, toy, capsy
     for place, message in (
         (
             ".",
-            ".: wanted a folder that can be replaced as a whole, got a disk or a parent of the current folder; give output=",
+            ".: wanted a folder that can be replaced as a whole, got a disk, a folder in a read-only one, or a parent of ",
         ),
         ("..", "..: wanted a folder that can be replaced as a whole"),
         ("circle", "circle: wanted a folder, got a link that cannot be resolved"),

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from dataclasses import asdict
@@ -67,6 +68,48 @@ def test_ctrl_c_stops_jobs_and_waits_for_them(tmp_path, monkeypatch):
         launch(jobs, tmp_path / "work", Launcher(), interrupt)
     assert list(tmp_path.glob("work/*/ended")), "it was waited for"
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.skipif(os.name != "posix", reason="whether a holder lives is only known on Unix")
+def test_only_what_earlier_calls_have_left_is_deleted(tmp_path):
+    host, ended = socket.gethostname(), subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    for name, pid, of_host in (
+        ("00000000", None, ""),  # ended
+        ("11111111", ended.pid, host),  # killed
+        ("22222222", os.getpid(), host),  # runs, on a file system without locks
+        ("33333333", 1, "elsewhere"),  # may run on another machine
+        ("mine", None, ""),  # not of this program
+    ):
+        (tmp_path / name).mkdir()
+        if pid is not None:
+            about = {"command": "snarf reproduce", "pid": pid, "host": of_host, "since": ""}
+            (tmp_path / f".{name}.holder.json").write_text(json.dumps(about))
+    (tmp_path / "notes").touch()
+    launching._remove_abandoned(tmp_path)
+    left = {"22222222", ".22222222.holder.json", "33333333", ".33333333.holder.json", "mine", "notes"}
+    assert {path.name for path in tmp_path.iterdir()} == left
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
+def test_jobs_do_not_outlive_an_error_of_the_call(tmp_path, monkeypatch):
+    jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
+    original = subprocess.Popen
+    code = "import pathlib, sys, time\nwork = pathlib.Path(sys.argv[1])\n"
+    code += "while not (work / 'stop').exists(): time.sleep(0.05)\n(work / 'ended').touch()\n"
+
+    def popen(command, **more):
+        (work,) = (tmp_path / "work").glob("[!.]*")
+        return original([sys.executable, "-c", code, str(work)], **more)
+
+    def fail(path):
+        raise MemoryError
+
+    monkeypatch.setattr(subprocess, "Popen", popen)
+    monkeypatch.setattr(launching, "_read", fail)
+    with pytest.raises(MemoryError):
+        launch(jobs, tmp_path / "work", Launcher(), lambda *_: None)
+    assert list(tmp_path.glob("work/*/ended")), "it was waited for"
 
 
 @pytest.mark.parametrize("any_plugin", [True, False])

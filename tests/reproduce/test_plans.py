@@ -72,6 +72,12 @@ def test_other_settings_have_other_folders_and_machines_do_not_matter(tmp_path):
     assert not [one for one in plain.train if one.startswith("threads")]
 
 
+def test_runs_are_told_apart_by_what_changes_the_avatar_alone():
+    # a setting that comes to these makes the digests of all existing runs differ
+    settings = {"data", "model", "skinning", "search", "shape", "condition", "training", "experiment"}
+    assert set(resolve_training(["training=quick"])) == settings
+
+
 def test_a_whole_table_comes_before_the_second_seed(tmp_path):
     plan = fake_plan(tmp_path, subjects=("50002", "50004"), seeds=(3, 1), systems=("nasa", "snarf"))
     assert [(job.seed, job.subject, job.row) for job in plan.jobs] == [

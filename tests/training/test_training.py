@@ -95,6 +95,18 @@ def test_other_settings_cannot_be_resumed(store):
         other.restore(state, "checkpoint.pt")
 
 
+def test_a_box_that_another_machine_has_rounded_differently_can_be_resumed(store):
+    state = trainer_for(store).state()
+    model = state["avatar"]["state"]
+    model["deformer.upper"] = torch.nextafter(model["deformer.upper"], torch.tensor(torch.inf))
+    resumed = trainer_for(store)
+    resumed.restore(state, "checkpoint.pt")
+    assert torch.equal(resumed.model.grid.upper, model["deformer.upper"])
+    model["deformer.upper"] = model["deformer.upper"] + 0.01
+    with pytest.raises(UserError, match="its canonical box is another"):
+        trainer_for(store).restore(state, "checkpoint.pt")
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_interrupt_ends_the_step_and_leaves_a_checkpoint(store, tmp_path, number, code):
     trainer = trainer_for(store)

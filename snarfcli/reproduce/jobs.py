@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import time
@@ -15,7 +14,7 @@ from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json, write_json
-from snarfcli.locks import inherited_locks, locked
+from snarfcli.locks import clear_killed, inherited_locks, locked
 from snarfcli.reproduce.plans import EvaluationStage, Job
 from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.samples.layout import samples_folder
@@ -150,6 +149,8 @@ class _Stages:
 
     def run(self) -> JobStatus:
         """Run the stages and return the final status."""
+        for output in (self.folder, *(Path(one.metrics).parent for one in self.job.evaluations)):
+            clear_killed(output)  # of commands that had all but ended, so that they are not run again
         if self.before.state == "diverged" and self.before.digest == self.job.digest and self._has_diverged():
             return replace(self.before, seconds={})
         for samples in self.job.samples:
@@ -246,8 +247,8 @@ def _wait(process: subprocess.Popen[bytes], stopped: Callable[[], bool]) -> tupl
             if is_request and asked_s is not None:
                 raise
             if asked_s is None and (is_request or stopped()):
-                # as Ctrl-C, after which a training writes its checkpoint
-                process.send_signal(signal.SIGINT if os.name == "posix" else signal.SIGTERM)
+                # as Ctrl-C, after which a training writes its checkpoint; but commands in the background ignore that
+                process.terminate()
                 asked_s = time.monotonic()
             elif asked_s is not None and time.monotonic() - asked_s > _PATIENCE_S:
                 process.kill()

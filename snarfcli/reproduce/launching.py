@@ -115,7 +115,10 @@ def launch(
     with hold_output(work, "snarf reproduce"):
         _remove_abandoned(folder)
         work.mkdir(parents=True)
-        return _launch(jobs, work, launcher, on_change)
+        statuses = _launch(jobs, work, launcher, on_change)
+    with contextlib.suppress(OSError):  # other calls have files there
+        folder.rmdir()
+    return statuses
 
 
 def _launch(

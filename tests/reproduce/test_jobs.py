@@ -170,12 +170,12 @@ def test_a_command_says_what_it_said_and_why_it_failed(job, tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
-def test_a_command_that_is_stopped_gets_one_ctrl_c(tmp_path, monkeypatch):
+def test_a_command_that_is_stopped_is_asked_once(tmp_path, monkeypatch):
     script = tmp_path / "program.py"
     script.write_text(
         "import signal, sys, time\n"
-        "def handle(*_): print('checkpoint written', flush=True); sys.exit(130)\n"
-        "signal.signal(signal.SIGINT, handle)\nprint('ready', flush=True)\ntime.sleep(600)\n"
+        "def handle(*_): print('checkpoint written', flush=True); sys.exit(143)\n"
+        "signal.signal(signal.SIGTERM, handle)\nprint('ready', flush=True)\ntime.sleep(600)\n"
     )
     original = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", lambda command, **more: original([sys.executable, str(script)], **more))

@@ -48,8 +48,12 @@ def _digest(path: Path) -> str:
             return "half"
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     if path.suffix == ".pt":
+        try:
+            content = torch.load(path, map_location="cpu", weights_only=True)
+        except RuntimeError:
+            return "half"
         digest = hashlib.sha256()
-        _add(digest, _without_varying(torch.load(path, map_location="cpu", weights_only=True)))
+        _add(digest, _without_varying(content))
         return digest.hexdigest()
     content = path.read_bytes()
     if path.name == "config.yaml":

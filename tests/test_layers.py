@@ -31,6 +31,7 @@ LAYERS = (
         "formats",
         "hydra_config",
         "native",
+        "output_locks",
         "parallel",
         "precision",
         "progress",

@@ -25,13 +25,13 @@ from snarfcli.commands.selection import (
 )
 from snarfcli.errors import UserError
 from snarfcli.files import remove_temporaries, write_json
-from snarfcli.locks import hold_output
 from snarfcli.meshing.extract import EmptySurface, FullSurface
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.mesh_files import MESH_WRITERS
 from snarfcli.meshing.posed import RESOLUTIONS, SURFACES
 from snarfcli.meshing.surfaces import canonical_surface
 from snarfcli.motions import Motion
+from snarfcli.output_locks import hold_output
 from snarfcli.parallel import count_cores, parse_processes
 from snarfcli.rendering.animation import CONTENTS, Animation, GroundTruthMeshes, place_canonical
 from snarfcli.rendering.panels import Screen, picture_size

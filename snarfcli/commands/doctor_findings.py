@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from snarfcli.files import find_temporaries
-from snarfcli.locks import can_lock, outputs_in_use
+from snarfcli.locks import can_lock
+from snarfcli.output_locks import outputs_in_use
 
 __all__ = ["Finding", "promises"]
 

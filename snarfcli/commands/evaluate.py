@@ -27,8 +27,8 @@ from snarfcli.evaluation.surface_metrics import measure_surfaces, surfaces_text
 from snarfcli.evaluation.weight_metrics import measure_weights, weights_text
 from snarfcli.files import remove_temporaries, write_json
 from snarfcli.fitting import PoseRefiner, refined_poses_text, require_refinable
-from snarfcli.locks import hold_output
 from snarfcli.models.start_bones import with_start_bones
+from snarfcli.output_locks import hold_output
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.store import SampleStore

@@ -19,9 +19,9 @@ from snarfcli.export.clips import Clip, on_ground
 from snarfcli.export.export import check_output
 from snarfcli.export.sequence import check_folder, tidy_folder
 from snarfcli.files import atomic_path, read_json, remove_temporaries, write_json
-from snarfcli.locks import clear_killed, hold_output
 from snarfcli.meshing.mesh_files import MESH_WRITERS
 from snarfcli.names import folder_name, folder_names
+from snarfcli.output_locks import clear_killed, hold_output
 
 __all__ = [
     "check_place",

@@ -20,6 +20,7 @@ from snarfcli.commands.train import TrainConfig
 from snarfcli.errors import UserError
 from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
+from snarfcli.output_locks import hold_output
 from snarfcli.parallel import count_cores
 from snarfcli.reproduce.jobs import JobStatus, read_status
 from snarfcli.reproduce.launching import LAUNCHERS, Launcher, check_launcher, launch
@@ -128,7 +129,9 @@ def run(config: ReproduceConfig) -> int:
             log.warning("warning: %d of %d runs are not done, so the exit code is 1; the report says why", undone, len(of_plan))
         resolution = config.figure_resolution if config.figures else None
         about = f"{launcher.processes} runs at a time" if launcher.processes > 1 else ""
-        for path in write_report(plan, of_plan, folder, _command(config), about=about, figure_resolution=resolution):
+        with hold_output(folder, "snarf reproduce", wait=True):
+            written = write_report(plan, of_plan, folder, _command(config), about=about, figure_resolution=resolution)
+        for path in written:
             log.info("written: %s", path)
     return 0 if all(result.state == "done" for result in results) else 1
 

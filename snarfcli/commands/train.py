@@ -21,7 +21,6 @@ from snarfcli.deformer import CanonicalGrid
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, read_json, remove_temporaries, write_json
 from snarfcli.fitting import RefinedPoses, refined_poses_text
-from snarfcli.locks import hold_all_inside, hold_output
 from snarfcli.models.checkpoint import load_checkpoint
 from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
@@ -30,6 +29,7 @@ from snarfcli.models.shape_sizes import with_shape_sizes
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.models.symmetry import find_mirror
 from snarfcli.models.trained_field import SYSTEMS
+from snarfcli.output_locks import hold_all_inside, hold_output
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.store import SampleStore
@@ -88,8 +88,12 @@ def _prepare(config: TrainConfig, folder: Path, device: torch.device) -> Trainer
             return None
         log.info("resuming at step %d of %d", trainer.step, config.training.steps)
     elif config.overwrite and folder.exists():
-        with hold_all_inside(folder):  # an evaluation, for example
-            shutil.rmtree(folder)
+        with hold_all_inside(folder, "snarf train", wait=config.wait):  # an evaluation, for example
+            for path in folder.iterdir():  # not the folder itself, which may be a link
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
     return trainer
 
 

@@ -14,7 +14,8 @@ from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json, write_json
-from snarfcli.locks import clear_killed, inherited_locks, locked
+from snarfcli.locks import inherited_locks, locked
+from snarfcli.output_locks import clear_killed
 from snarfcli.reproduce.plans import EvaluationStage, Job
 from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.samples.layout import samples_folder

@@ -28,7 +28,8 @@ from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.interrupts import signals_as_interrupts
-from snarfcli.locks import hold_output, holder_is_gone, inherited_locks, lock_file, may_be_in_use, one_of, try_lock
+from snarfcli.locks import inherited_locks, one_of, try_lock
+from snarfcli.output_locks import hold_output, holder_is_gone, lock_file, may_be_in_use
 from snarfcli.reproduce.jobs import JobStatus, read_job_status, run_job
 from snarfcli.reproduce.plans import Job
 from snarfcli.safe_start import safe_environment, snarf_command

@@ -14,7 +14,7 @@ import numpy as np
 from snarfcli.datasets.splits import SPLITS
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.errors import UserError, nearest
-from snarfcli.locks import hold_output
+from snarfcli.output_locks import hold_output
 from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
 from snarfcli.samples.finished import complete_sequences, write_subject

@@ -268,6 +268,30 @@ def test_a_crash_leaves_nothing(folder, capsys, monkeypatch):
     assert not any(path.is_file() for path in folder.rglob("*") if path.name != "avatar.pt")
 
 
+def test_an_export_without_its_record_can_be_run_again(folder, toy, capsys, monkeypatch):
+    def die(*arguments, **more):
+        raise KeyboardInterrupt
+
+    place = folder / "export"
+    arguments = ("--pose", pose_file("walk.npz", 2))
+    with monkeypatch.context() as patch:
+        patch.setattr("snarfcli.commands.export.write_record", die)
+        assert export(capsys, *arguments)[0] == 130
+    assert json.loads((place / "50002_glb.json").read_text())["complete"] is False
+    whole = (place / "50002.glb").read_bytes()
+    assert export(capsys, *arguments) == (0, "")
+    assert (place / "50002.glb").read_bytes() == whole
+    assert json.loads((place / "50002_glb.json").read_text())["complete"] is True
+    code, err = export(capsys, *arguments)
+    assert code == 2
+    assert "50002.glb exists already; give overwrite=true" in err
+    with monkeypatch.context() as patch:  # nothing new was written, so the record of what is there stays
+        patch.setattr("snarfcli.commands.export.export_character", die)
+        assert export(capsys, *arguments, "overwrite=true")[0] == 130
+    assert json.loads((place / "50002_glb.json").read_text())["complete"] is True
+    assert sorted(path.name for path in place.iterdir()) == ["50002.glb", "50002_glb.json"]
+
+
 def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
     follow, calls = SkinnedSurface.canonical_vertices, []
 
@@ -378,6 +402,11 @@ def test_a_vrm_model_and_its_motions(human, capsys, caplog):
     assert "50002_punching.vrma exists already; give overwrite=true" in err
     assert export(capsys, *arguments, "overwrite=true")[0] == 0
     assert (place / "50002.vrma").exists()  # a single motion has the name of the model
+    Path("mine.vrma").write_text("mine")
+    code, err = export(capsys, *arguments, "output=mine.vrm")
+    assert code == 2
+    assert "mine.vrma exists already; give overwrite=true" in err
+    assert not Path("mine.vrm").exists()
 
 
 @pytest.mark.parametrize("arguments", [("format=vrm",), ("names=unreal",)], ids=" ".join)

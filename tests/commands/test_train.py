@@ -17,6 +17,7 @@ from snarfcli.commands.train import TrainConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.fitting import PoseRefiner
+from snarfcli.runs import run_folder
 from snarfcli.samples.store import SampleStore
 from snarfcli.training.trainer import Trainer
 
@@ -161,3 +162,16 @@ def test_settings_that_cannot_be_used_make_nothing(config, group, changes, messa
     with pytest.raises(UserError, match=message):
         run(replace(config, **{group: replace(getattr(config, group), **changes)}))
     assert not Path(config.output_root).exists()
+
+
+def test_a_run_folder_that_is_a_link_can_be_replaced(config, tmp_path):
+    place = run_folder(config.output_root, config.data.name, config.subject, config.run)
+    place.parent.mkdir(parents=True)
+    (tmp_path / "elsewhere" / "old").mkdir(parents=True)
+    (tmp_path / "elsewhere" / "checkpoint.pt").touch()
+    place.symlink_to(tmp_path / "elsewhere")
+    config.overwrite = True
+    run(config)
+    assert place.is_symlink()
+    assert (tmp_path / "elsewhere" / "avatar.pt").is_file()
+    assert not (tmp_path / "elsewhere" / "old").exists()

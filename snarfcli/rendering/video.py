@@ -9,7 +9,6 @@ import numpy as np
 
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path
-from snarfcli.texts import one_line
 
 __all__ = ["write_video"]
 
@@ -56,7 +55,7 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], frame_rate: floa
                         pix_fmt_in="rgb24",
                         pix_fmt_out="yuv420p",
                         macro_block_size=2,
-                        ffmpeg_log_level="error",
+                        ffmpeg_log_level="quiet",  # it would print its errors between the messages of the command
                         # faststart puts the index first, so that a browser can play before it has the whole file.
                         output_params=["-crf", str(quality), "-preset", "medium", "-movflags", "+faststart"],
                     )
@@ -66,22 +65,23 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], frame_rate: floa
                 even = np.pad(frame, np.array([(0, height % 2), (0, width % 2), (0, 0)]), mode="edge")
                 try:
                     writer.send(np.ascontiguousarray(even))
-                except OSError as error:  # the encoder has ended; the message has all its output
-                    raise _not_encoded(path, str(error).strip().splitlines()[-1]) from None
+                except OSError:
+                    raise _not_encoded(path, "the encoder ended early") from None
                 count += 1
         finally:
             if writer is not None:
                 writer.close()
         if count == 0:
             raise ValueError(f"frames: wanted at least one picture for {path}, got none")
-        if not _is_whole(temporary):  # the encoder does not tell that the disk was full
+        if not _is_whole(temporary):  # as after a full disk, which imageio does not report
             raise _not_encoded(path, "the file is not complete")
     return count
 
 
 def _not_encoded(path: Path | str, reason: str) -> UserError:
-    why = one_line(reason, 200)
-    return UserError(f"video {path} could not be encoded ({why}); check the free space on the disk, then run the command again")
+    return UserError(
+        f"video {path} could not be encoded ({reason}); check the free space on the disk, then run the command again"
+    )
 
 
 def _is_whole(path: Path) -> bool:

@@ -79,9 +79,8 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], frame_rate: floa
 
 
 def _not_encoded(path: Path | str, reason: str) -> UserError:
-    return UserError(
-        f"video {path} could not be encoded ({reason}); check the free space on the disk, then run the command again"
-    )
+    advice = "check the free space on the disk, then run the command again"
+    return UserError(f"video {path} could not be encoded ({reason}); {advice}")
 
 
 def _is_whole(path: Path) -> bool:

@@ -4,6 +4,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from snarfcli.errors import UserError
 from snarfcli.rendering.video import write_video
 
 
@@ -54,6 +55,20 @@ def test_a_failure_leaves_nothing(tmp_path):
     with pytest.raises(RuntimeError, match="the renderer fell"):
         write_video(tmp_path / "video.mp4", broken(), 30)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_video_that_is_cut_off_is_not_kept(tmp_path, capfd):
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    noise = np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3)).astype(np.uint8)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))  # as on a full disk
+    try:
+        with pytest.raises(UserError, match=r"video .*video.mp4 could not be encoded \(.*\); check the free space"):
+            write_video(tmp_path / "video.mp4", iter(noise), 30)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from snarfcli.texts import one_line
 
 __all__ = [
     "clear_killed",
+    "count_killed",
     "hold_all_inside",
     "hold_output",
     "holder_is_gone",
@@ -79,6 +80,11 @@ def clear_killed(output: str | Path) -> None:
     if lock_file(Path(os.path.realpath(output))).exists():
         with suppress(UserError), hold_output(output, "snarf"):
             pass
+
+
+def count_killed(folder: Path) -> int:
+    """Return the number of outputs below a folder whose holders were killed, and whose locks are still there."""
+    return sum(_is_gone(_read(about)) for about in folder.rglob(f".*{_ABOUT}"))
 
 
 def holder_is_gone(output: Path) -> bool:

@@ -13,7 +13,7 @@ from snarfcli.cli.command_list import COMMANDS, Command
 from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.help import command_help, overview
 from snarfcli.cli.messages import user_message
-from snarfcli.cli.terminal import print_error, set_up_output
+from snarfcli.cli.terminal import output_failure, print_error, set_up_output
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import check_overrides, readable
@@ -44,11 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _open_standard_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(overview())
-        return 0
+        return _print(overview())
     if arguments[0] in ("-V", "--version"):
-        print(f"snarf {snarfcli.__version__}")
-        return 0
+        return _print(f"snarf {snarfcli.__version__}")
     if arguments[0] not in COMMANDS:
         hint = nearest(arguments[0], _shown())
         print_error(f"snarf: unknown command '{arguments[0]}'{hint}; commands are {', '.join(_shown())}")
@@ -60,7 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     set_up_output()
     try:
         with signals_as_interrupts():
-            return _run(command, arguments[1:])
+            code = _run(command, arguments[1:])
+        return code or _check_output(command.name)
     except KeyboardInterrupt as interrupt:
         print_error(f"snarf {command.name}: interrupted")
         return exit_code(interrupt)
@@ -69,6 +68,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except Exception as error:
         return _report(command, error)
+
+
+def _print(text: str) -> int:
+    """Print a text on standard output and return the exit code."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        return 0
+    except OSError as error:
+        print_error(f"snarf: standard output: {error.strerror}; free some space, or write elsewhere")
+        return EXIT_USER_ERROR
+    return 0
+
+
+def _check_output(command: str) -> int:
+    """Return the exit code of a command that has succeeded: an error if what it printed is lost, as on a full disk."""
+    reason = output_failure()
+    if reason is None:
+        return 0
+    print_error(f"snarf {command}: standard output: {reason}; all files are written, but what it printed is lost")
+    return EXIT_USER_ERROR
 
 
 def _report(command: Command, error: Exception) -> int:

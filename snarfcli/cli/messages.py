@@ -41,7 +41,7 @@ def _message(error: BaseException) -> str | None:
     return None
 
 
-_NO_PERMISSION = "no permission; change its permissions, or name another place (output_root=... or data_root=...)"
+_NO_PERMISSION = "no permission; change its permissions, or name another place (output_root=..., data_root=... or output=...)"
 
 
 def _chain(error: BaseException) -> list[BaseException]:
@@ -67,7 +67,8 @@ def _file_message(error: OSError) -> str:
         errno.ENOMEM: "not enough memory; close other programs",
         errno.EIO: "the disk reports an error; the file itself may be whole; check the disk, or copy the folder to another one",
         errno.ESTALE: "the network drive lost it; try again",
-        errno.EROFS: "the file system is read-only; choose another folder with output_root=... or data_root=...",
+        errno.EROFS: "the file system is read-only; choose another place with output_root=..., data_root=... or output=...",
+        errno.EFBIG: "larger than the file system or a limit (`ulimit -f`) allows; raise the limit, or choose another place",
         errno.ENOTDIR: "part of the path is a file, not a folder; choose another folder",
         errno.EISDIR: "is a folder, not a file",
         errno.EEXIST: "is a file, not a folder; choose another folder",

@@ -11,7 +11,7 @@ from types import TracebackType
 
 from snarfcli.texts import terminal_text
 
-__all__ = ["TerminalFormatter", "print_error", "set_up_output"]
+__all__ = ["TerminalFormatter", "output_failure", "print_error", "set_up_output"]
 
 _LONGEST = 20_000  # characters of one log record; the longest table has 3,000
 
@@ -26,13 +26,29 @@ class TerminalFormatter(logging.Formatter):
 
 def set_up_output() -> None:
     """Print the program's own messages on standard output, without time or level; make other output safe to show too."""
-    handler = logging.StreamHandler(sys.stdout)
+    handler = _Handler(sys.stdout)
     handler.setFormatter(TerminalFormatter("%(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     logging.getLogger("snarfcli").setLevel(logging.INFO)
-    logging.raiseExceptions = False  # no trace when the reader of the output has ended, as in "| head"
+    logging.raiseExceptions = False  # no trace of anything else that is logged wrongly
     warnings.formatwarning = _format_warning
     sys.excepthook = _print_trace
+
+
+class _Handler(logging.StreamHandler):  # pyright: ignore[reportMissingTypeArgument]  # not generic in Python 3.10
+    """Writes log records, and remembers why one could not be written."""
+
+    failure: str | None = None
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        error = sys.exc_info()[1]
+        if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):  # "| head" has seen enough
+            _Handler.failure = error.strerror or type(error).__name__
+
+
+def output_failure() -> str | None:
+    """Return why some of what was logged could not be written to standard output, None if all was."""
+    return _Handler.failure
 
 
 def print_error(text: str) -> None:

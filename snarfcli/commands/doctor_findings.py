@@ -9,7 +9,7 @@ from pathlib import Path
 
 from snarfcli.files import find_temporaries
 from snarfcli.locks import can_lock
-from snarfcli.output_locks import outputs_in_use
+from snarfcli.output_locks import count_killed, outputs_in_use
 
 __all__ = ["Finding", "promises"]
 
@@ -29,14 +29,14 @@ def promises(data_root: Path, output_root: Path) -> Iterator[Finding]:
     roots = list(dict.fromkeys(root for root in (data_root, output_root) if root.is_dir()))
     yield Finding("files", "appear whole or not at all, and are on the disk before they get their names")
     yield Finding("a second run", "completes what an interrupted or killed one has left, with the same files")
-    left = sum(len(find_temporaries(root, recursive=True)) for root in roots)
-    unfinished = f"{left} temporary files, of running commands or of killed ones, which delete them when run again"
+    left = sum(len(find_temporaries(root, recursive=True)) + count_killed(root) for root in roots)
+    unfinished = f"{left} temporary files and locks, of running commands or of killed ones, which delete them when run again"
     yield Finding("left behind", unfinished if left else "nothing")
     yield Finding("two at once", "an output folder has one writer; the second is told who it is, or waits with wait=true")
     yield from (_locks(root) for root in roots)
     used = [line for root in roots for line in outputs_in_use(root)]
     yield Finding("in use now", "; ".join(used) if used else "nothing")
-    yield Finding("files of others", "are read as numbers only, and checked before anything is built; they cannot run code")
+    yield Finding("files of others", "are read as plain data, and checked before anything is built; they cannot run code")
 
 
 def _locks(root: Path) -> Finding:

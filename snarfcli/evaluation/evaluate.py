@@ -146,7 +146,7 @@ def _occupied(values: FieldSamples, sequence: SequenceSamples, index: int) -> Te
     if bool(logits.isnan().any()):
         raise UserError(
             f"{sequence.name}, frame {sequence.frame_numbers[index]}: the avatar's occupancy is NaN at "
-            f"{int(logits.isnan().sum())} of {len(logits)} points; train it again"
+            f"{int(logits.isnan().sum())} of {len(logits)} points; train it again, or get it again"
         )
     return logits > 0
 

@@ -35,7 +35,7 @@ def load_checkpoint(path: str | Path, file_format: str, version: int, what: str)
     came = content.get("version")
     if type(came) is not int or came != version:
         shown = came if type(came) is int else "none"
-        raise UserError(f"{what} {path}: wanted format version {version}, got {shown}; train it again")
+        raise UserError(f"{what} {path}: wanted format version {version}, got {shown}; train it again, or get it again")
     return _with_tensors(content, {})
 
 

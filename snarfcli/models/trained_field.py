@@ -134,7 +134,9 @@ class TrainedField:
             if is_out_of_memory(error):
                 raise MemoryError(f"not enough memory to load {path}; close other programs") from None
             reason = f"no {error}" if isinstance(error, KeyError) else one_line(error, 300)
-            raise UserError(f"{path} does not describe an avatar of this version ({reason}); train it again") from None
+            raise UserError(
+                f"{path} does not describe an avatar of this version ({reason}); train it again, or get it again"
+            ) from None
         avatar.model.eval()
         return avatar
 

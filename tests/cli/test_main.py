@@ -297,3 +297,15 @@ def test_reproduce_passes_names_on(capsys, caplog, elsewhere, monkeypatch):
     assert f"data_root='{elsewhere / 'home' / 'Daten (alt)'}'" in arguments
     assert "output_root='größe'" in arguments
     assert not (elsewhere / "~").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full disk to write to")
+@pytest.mark.parametrize("arguments", [["--help"], ["doctor", "output_root=none", "data_root=none"]], ids=" ".join)
+def test_lost_output_is_an_error(tmp_path, arguments):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "snarfcli", *arguments], stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+        )
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "standard output: No space left on device; " in line

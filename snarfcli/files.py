@@ -68,7 +68,7 @@ def atomic_path(path: str | Path, *, flush_name: bool = True) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def remove_temporaries(folder: Path, *names: str) -> None:
+def remove_temporaries(folder: Path, *names: str, recursive: bool = False) -> None:
     """Delete what killed processes have left of files that `atomic_path` was writing in a folder.
 
     Only the holder of the folder's lock may do so: the files of a running process look alike.
@@ -76,13 +76,14 @@ def remove_temporaries(folder: Path, *names: str) -> None:
     Args:
         folder: the folder, which need not exist.
         names: names of the files that were being written; any if none is given.
+        recursive: whether in the folders below too.
     """
-    for path in find_temporaries(folder, *names):
+    for path in find_temporaries(folder, *names, recursive=recursive):
         path.unlink(missing_ok=True)
 
 
 def find_temporaries(folder: Path, *names: str, recursive: bool = False) -> list[Path]:
-    """Return the files that `remove_temporaries` deletes; with `recursive`, also those in the folders below."""
+    """Return the files that `remove_temporaries` deletes."""
     found = []
     for path in folder.glob("**/.*.tmp*" if recursive else ".*.tmp*"):
         match = _TEMPORARY.fullmatch(path.name)

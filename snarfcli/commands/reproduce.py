@@ -18,6 +18,7 @@ from omegaconf import MISSING, OmegaConf
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.train import TrainConfig
 from snarfcli.errors import UserError
+from snarfcli.files import remove_temporaries
 from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 from snarfcli.output_locks import hold_output
@@ -130,6 +131,7 @@ def run(config: ReproduceConfig) -> int:
         resolution = config.figure_resolution if config.figures else None
         about = f"{launcher.processes} runs at a time" if launcher.processes > 1 else ""
         with hold_output(folder, "snarf reproduce", wait=True):
+            remove_temporaries(folder, recursive=True)
             written = write_report(plan, of_plan, folder, _command(config), about=about, figure_resolution=resolution)
         for path in written:
             log.info("written: %s", path)

@@ -13,7 +13,7 @@ from typing import Any
 from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.evaluation.report import STORE_SPLITS
-from snarfcli.files import read_json, write_json
+from snarfcli.files import read_json, remove_temporaries, write_json
 from snarfcli.locks import inherited_locks, locked
 from snarfcli.output_locks import clear_killed
 from snarfcli.reproduce.plans import EvaluationStage, Job
@@ -152,6 +152,7 @@ class _Stages:
         """Run the stages and return the final status."""
         for output in (self.folder, *(Path(one.metrics).parent for one in self.job.evaluations)):
             clear_killed(output)  # of commands that had all but ended, so that they are not run again
+        remove_temporaries(self.folder, STATUS)
         if self.before.state == "diverged" and self.before.digest == self.job.digest and self._has_diverged():
             return replace(self.before, seconds={})
         for samples in self.job.samples:

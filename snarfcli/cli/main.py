@@ -13,7 +13,7 @@ from snarfcli.cli.command_list import COMMANDS, Command
 from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.help import command_help, overview
 from snarfcli.cli.messages import user_message
-from snarfcli.cli.terminal import output_failure, print_error, set_up_output
+from snarfcli.cli.terminal import abandon_output, output_failure, print_error, set_up_output
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import check_overrides, readable
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_error(f"snarf {command.name}: interrupted")
         return exit_code(interrupt)
     except BrokenPipeError:  # the reader of the output has ended, as in "| head"
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        abandon_output()
         return 0
     except Exception as error:
         return _report(command, error)
@@ -75,8 +75,9 @@ def _print(text: str) -> int:
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        return 0
+        abandon_output()
     except OSError as error:
+        abandon_output()
         print_error(f"snarf: standard output: {error.strerror}; free some space, or write elsewhere")
         return EXIT_USER_ERROR
     return 0
@@ -87,6 +88,7 @@ def _check_output(command: str) -> int:
     reason = output_failure()
     if reason is None:
         return 0
+    abandon_output()
     print_error(f"snarf {command}: standard output: {reason}; all files are written, but what it printed is lost")
     return EXIT_USER_ERROR
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import sys
 import traceback
 import warnings
@@ -11,7 +12,7 @@ from types import TracebackType
 
 from snarfcli.texts import terminal_text
 
-__all__ = ["TerminalFormatter", "output_failure", "print_error", "set_up_output"]
+__all__ = ["TerminalFormatter", "abandon_output", "output_failure", "print_error", "set_up_output"]
 
 _LONGEST = 20_000  # characters of one log record; the longest table has 3,000
 
@@ -44,6 +45,14 @@ class _Handler(logging.StreamHandler):  # pyright: ignore[reportMissingTypeArgum
         error = sys.exc_info()[1]
         if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):  # "| head" has seen enough
             _Handler.failure = error.strerror or type(error).__name__
+
+
+def abandon_output() -> None:
+    """Drop what waits to be written to standard output, and what follows: Python would try again at its exit, and fail."""
+    with contextlib.suppress(OSError, ValueError):  # it is no file
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
 
 
 def output_failure() -> str | None:

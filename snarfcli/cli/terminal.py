@@ -43,7 +43,9 @@ class _Handler(logging.StreamHandler):  # pyright: ignore[reportMissingTypeArgum
 
     def handleError(self, record: logging.LogRecord) -> None:
         error = sys.exc_info()[1]
-        if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):  # "| head" has seen enough
+        if isinstance(error, BrokenPipeError):  # "| head" has seen enough
+            abandon_output()
+        elif isinstance(error, OSError):
             _Handler.failure = error.strerror or type(error).__name__
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import shlex
 import signal
 import subprocess
@@ -309,3 +310,10 @@ def test_lost_output_is_an_error(tmp_path, arguments):
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert "standard output: No space left on device; " in line
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes of a shell")
+def test_a_reader_that_has_seen_enough_is_no_error(tmp_path):
+    command = f"{shlex.quote(sys.executable)} -m snarfcli doctor output_root=none | head -n 1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=tmp_path)
+    assert (done.stdout, done.stderr) == ("versions\n", "")

@@ -30,7 +30,7 @@ from released_search import released_search
 from torch import Tensor
 
 from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences
-from snarfcli.deformer.correspondences import _start_transforms
+from snarfcli.deformer.grid_search import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.native import cuda, cuda_compile, cuda_driver, cuda_launches
 

@@ -4,11 +4,12 @@ Usable alone, in any neural field: see `ForwardDeformer`.
 """
 
 from snarfcli.deformer.cells import cells_near
-from snarfcli.deformer.correspondences import Correspondences, find_correspondences
+from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.deformer import ForwardDeformer
 from snarfcli.deformer.diffusion import PresetWeights
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid
+from snarfcli.deformer.grid_search import find_correspondences
 from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, skin
 from snarfcli.deformer.skinning_config import SkinningConfig

@@ -10,9 +10,10 @@ from torch import Tensor, nn
 
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.complete import posed_cell_boxes
-from snarfcli.deformer.correspondences import Correspondences, check_transforms, find_correspondences
+from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
+from snarfcli.deformer.grid_search import check_transforms, find_correspondences
 from snarfcli.deformer.hierarchy import make_softmax
 from snarfcli.deformer.search_config import SearchConfig, as_search_config
 from snarfcli.deformer.skinning import blend_transforms, interpolate, skin

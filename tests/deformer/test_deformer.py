@@ -16,8 +16,8 @@ from snarfcli.deformer import (
     PresetWeights,
     SearchConfig,
     SkinningConfig,
-    correspondences,
     find_correspondences,
+    grid_search,
 )
 from snarfcli.deformer.skinning_config import FIELDS
 
@@ -198,7 +198,7 @@ class Operators(TorchDispatchMode):
 @pytest.mark.parametrize("name", ["distilled", "voxel", "preset"])
 def test_a_search_with_a_capacity_waits_for_nothing(name, monkeypatch):
     """On a GPU, where values are not checked: sizes that depend on data, and numbers read from tensors, would wait."""
-    monkeypatch.setattr(correspondences, "_skips_checks", lambda tensor: True)
+    monkeypatch.setattr(grid_search, "_skips_checks", lambda tensor: True)
     module, other = deformer(name), deformer(name, seed=1)
     cells = torch.ones(5, 6, 7, dtype=torch.bool)
     cells[0] = False

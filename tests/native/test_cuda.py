@@ -20,7 +20,7 @@ from snarfcli.deformer import (
     find_correspondences,
     ops,
 )
-from snarfcli.deformer.correspondences import _start_transforms
+from snarfcli.deformer.grid_search import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.native import cpu, cuda, cuda_compile, cuda_driver, cuda_launches
 from snarfcli.native.library import native_library

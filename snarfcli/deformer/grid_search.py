@@ -1,0 +1,155 @@
+"""Find every canonical correspondence of posed points on a weight grid, with exact implicit gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from snarfcli.deformer.cells import corners_of
+from snarfcli.deformer.correspondences import Correspondences
+from snarfcli.deformer.grid import CanonicalGrid
+from snarfcli.deformer.ops import broyden_search, complete_search
+from snarfcli.deformer.roots import invert_3x3
+from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
+from snarfcli.deformer.skinning import blend_transforms
+
+__all__ = ["check_transforms", "find_correspondences"]
+
+
+def find_correspondences(
+    points: Tensor,
+    bone_transforms: Tensor,
+    skinning_weights: Tensor,
+    grid: CanonicalGrid,
+    *,
+    search: SearchConfig | str | None = None,
+    active_cells: Tensor | None = None,
+    capacity: int | None = None,
+    check: bool = True,
+) -> Correspondences:
+    """Find the canonical points that forward skinning moves onto the given posed points.
+
+    Args:
+        points: [B, N, 3], queries, posed space, metres. A non-finite point has no correspondence.
+        bone_transforms: [B, J, 4, 4], canonical to posed, metres; invertible.
+        skinning_weights: [D, H, W, J], at the grid nodes (z, y, x), rows sum to 1.
+        grid: the box of the nodes.
+        search: settings of the search, or its name: "complete" (cell by cell, without start bones) or "broyden" (the papers',
+            from one start per bone). None for the defaults of `SearchConfig`.
+        active_cells: [D-1, H-1, W-1], bool, the cells in which a complete search looks for roots; None for all.
+        capacity: maximum number of roots to return. The results always have this length, and rows beyond the roots have the
+            query B * N; so nothing waits for a GPU, and the call can be captured in a CUDA graph. torch.compile with
+            fullgraph=True needs it too, or torch._dynamo.config.capture_dynamic_output_shape_ops.
+        check: whether to check the values of transforms and weights; skipped on a GPU, where it would force a synchronisation.
+
+    Returns:
+        The correspondences, differentiable in `points`, `bone_transforms` and `skinning_weights` by implicit
+        differentiation at the roots; the iterations are not differentiated. There is no second derivative.
+
+    Raises:
+        ValueError: a shape, name or index does not fit, a transform is not finite or singular, or weights do not sum to 1; the
+            message names the argument, what was wanted and what came.
+        TypeError: a dtype is not float32 or float64, or the dtypes differ.
+
+    Source: SNARF Sec. 3.2 and 3.4 (Eq. 5-9, 14); Fast-SNARF Sec. 4.
+    """
+    search = as_search_config(search)
+    _check_shapes(points, bone_transforms, skinning_weights, active_cells)
+    check_search_config(search, bone_transforms.shape[1])
+    if search.name == "broyden" and active_cells is not None:
+        raise ValueError("active_cells needs search.name 'complete': a broyden search has no cells")
+    if capacity is not None and capacity < 0:
+        raise ValueError(f"capacity: wanted 0 or more, got {capacity}")
+    grid = grid.to(points)
+    if check:
+        _check_values(grid, bone_transforms, skinning_weights, active_cells)
+    depth, height, width = skinning_weights.shape[:3]
+    transforms = blend_transforms(skinning_weights, bone_transforms, active_cells, search.backend)
+    box = (grid.lower, grid.upper, [depth, height, width])
+    common = (search.orientation_preserving, capacity, search.backend)
+    if search.name == "complete":
+        found = complete_search(points, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
+    else:
+        starts = _start_transforms(bone_transforms.detach(), search.init_bones)
+        limits = (search.tolerance, search.divergence, search.max_steps)
+        found = broyden_search(points, transforms, starts, *box, *limits, search.jacobian == "exact", *common)
+    canonical, query, jacobian_inverse, total = found
+    return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
+
+
+def _start_transforms(bone_transforms: Tensor, init_bones: Sequence[int] | None) -> Tensor:
+    """Return the upper rows of the inverse transforms of the start bones, [B, I, 12], posed to canonical."""
+    # Stacked, since a list as an index would be copied to a GPU, which waits for it.
+    chosen = bone_transforms if init_bones is None else torch.stack([bone_transforms[:, bone] for bone in init_bones], 1)
+    turn, _ = invert_3x3(chosen[..., :3, :3].reshape(-1, 3, 3))
+    shift = -(turn * chosen[..., :3, 3].reshape(-1, 1, 3)).sum(-1)
+    return torch.cat([turn, shift[..., None]], -1).reshape(*chosen.shape[:2], 12)
+
+
+@torch.no_grad()
+def check_transforms(bone_transforms: Tensor) -> None:
+    """Raise ValueError for transforms [B, J, 4, 4] that are not finite or singular.
+
+    Skipped on a GPU, where the check would force a synchronisation.
+    """
+    if _skips_checks(bone_transforms):
+        return
+    if not bool(bone_transforms.isfinite().all()):
+        raise ValueError("bone_transforms: wanted finite numbers, got NaN or infinite ones")
+    turn = bone_transforms[..., :3, :3].reshape(-1, 3, 3)
+    _, determinant = invert_3x3(turn)
+    singular = (determinant.abs() <= 1e-9 * turn.abs().amax((1, 2)) ** 3).nonzero()[:, 0]
+    if len(singular):
+        pose, bone = divmod(int(singular[0]), bone_transforms.shape[1])
+        raise ValueError(f"bone_transforms: wanted invertible ones, got a singular one for bone {bone} of pose {pose}")
+
+
+def _skips_checks(tensor: Tensor) -> bool:
+    """Return whether reading the values of a tensor would wait for a GPU, or break a graph that is compiled."""
+    return tensor.is_cuda or torch.compiler.is_compiling()
+
+
+def _check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
+    """Raise ValueError if grid, transforms or weights are invalid. Skipped on a GPU, as in `check_transforms`."""
+    if _skips_checks(bone_transforms):
+        return
+    if not bool((grid.upper > grid.lower).all()):
+        box = f"{grid.lower.tolist()} and {grid.upper.tolist()}"
+        raise ValueError(f"grid.upper: wanted more than grid.lower in {grid.lower.dtype}, got {box}")
+    check_transforms(bone_transforms)
+    with torch.no_grad():
+        wrong = ~((skinning_weights.sum(-1) - 1).abs() < 1e-3)
+        if active_cells is not None:
+            wrong &= corners_of(active_cells)
+        if bool(wrong.any()):
+            came = float(skinning_weights[wrong][0].sum())
+            raise ValueError(f"skinning_weights: wanted a sum of 1 at every node of a searched cell, got {came:.4g}")
+
+
+def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
+    """Raise ValueError or TypeError if the tensors do not fit together."""
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise ValueError(f"points: wanted shape [B, N, 3], got {list(points.shape)}")
+    if skinning_weights.ndim != 4 or min(skinning_weights.shape[:3]) < 2 or skinning_weights.shape[3] < 1:
+        raise ValueError(
+            f"skinning_weights: wanted shape [D, H, W, J], at least 2 nodes per side, got {list(skinning_weights.shape)}"
+        )
+    wanted = [points.shape[0], skinning_weights.shape[3], 4, 4]
+    if list(bone_transforms.shape) != wanted:
+        raise ValueError(f"bone_transforms: wanted shape {wanted} to fit the others, got {list(bone_transforms.shape)}")
+    for name, tensor in (("points", points), ("bone_transforms", bone_transforms), ("skinning_weights", skinning_weights)):
+        if tensor.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"{name}: wanted float32 or float64, got {tensor.dtype}")
+        if tensor.dtype != points.dtype:
+            raise TypeError(f"{name}: wanted the dtype of points, {points.dtype}, got {tensor.dtype}")
+        if tensor.device != points.device:
+            raise ValueError(f"{name}: wanted the device of points, {points.device}, got {tensor.device}")
+    if active_cells is None:
+        return
+    cells = [n - 1 for n in skinning_weights.shape[:3]]
+    if list(active_cells.shape) != cells or active_cells.dtype != torch.bool:
+        raise ValueError(f"active_cells: wanted bool {cells}, got {active_cells.dtype} {list(active_cells.shape)}")
+    if active_cells.device != points.device:
+        raise ValueError(f"active_cells: wanted the device of points, {points.device}, got {active_cells.device}")

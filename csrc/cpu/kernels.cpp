@@ -7,7 +7,9 @@
 #include "kernels.h"
 
 #include "bins.h"
+#include "cell_lanes.h"
 #include "lanes.h"
+#include "pair_search.h"
 #include "snarf/broyden.h"
 #include "snarf/cell.h"
 #include "snarf/implicit.h"
@@ -17,13 +19,6 @@
 namespace snarf {
 namespace SNARF_ISA {
 namespace {
-
-// The polynomials of as many cells as there are lanes, laid out so that one cell's numbers can be picked out.
-template <class S>
-struct CellLanes {
-  Cell<Lanes<S>> cell;
-  CellBounds<Lanes<S>> bounds;
-};
 
 // One cell or part of a cell, ready to be searched.
 template <class S>
@@ -53,30 +48,6 @@ Grid<S> grid_of(const Geometry<S>& geometry) {
     grid.nodes[i] = geometry.nodes[i];
   }
   return grid;
-}
-
-// Cells x .. x + width - 1 of a row, one per lane; beyond the end of the row the last node is repeated.
-template <class S>
-void load_cells(const S* transforms, const Geometry<S>& geometry, int x, int y, int z, Cell<Lanes<S>>& out) {
-  using V = Lanes<S>;
-  constexpr int width = V::width;
-  const int64_t row_nodes = geometry.nodes[0];
-  V corner[8 * 12];
-  for (int row = 0; row < 4; ++row) {
-    const S* const nodes = transforms + 12 * ((int64_t(z + (row >> 1)) * geometry.nodes[1] + y + (row & 1)) * row_nodes);
-    const S* node[width + 1];
-    for (int i = 0; i <= width; ++i) node[i] = nodes + 12 * (x + i < row_nodes ? x + i : row_nodes - 1);
-    V* const left = corner + 24 * row;
-    load_rows(node, left);
-    for (int r = 0; r < 12; ++r) left[12 + r] = shifted(left[r], node[width][r]);
-  }
-  V centre[3];
-  S along[width];
-  for (int i = 0; i < width; ++i) along[i] = geometry.lower[0] + (S(x + i) + S(0.5)) * geometry.size[0];
-  centre[0] = load<S>(along);
-  centre[1] = V(geometry.lower[1] + (S(y) + S(0.5)) * geometry.size[1]);
-  centre[2] = V(geometry.lower[2] + (S(z) + S(0.5)) * geometry.size[2]);
-  cell_from_corners(corner, centre, geometry.size, out);
 }
 
 // Numbers that repeat with the period of x, y, z over three packs of lanes, as `points` [N, 3] do.
@@ -513,7 +484,8 @@ void backward(const BackwardTask<S>& task) {
 
 template <class S>
 Kernels<S> kernels() {
-  return {blend<S>, blend_weights<S>, blend_bones<S>, extent<S>, bins<S>, boxes<S>, search<S>, broyden_queries<S>, backward<S>};
+  return {blend<S>,  blend_weights<S>, blend_bones<S>,     extent<S>,          bins<S>,    boxes<S>,
+          search<S>, bounds<S>,        search_prepared<S>, broyden_queries<S>, backward<S>};
 }
 template Kernels<float> kernels<float>();
 template Kernels<double> kernels<double>();

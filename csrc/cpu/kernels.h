@@ -73,6 +73,55 @@ struct CompleteTask {
   bool orientation_preserving;
 };
 
+// The bounds of a cell (cell.h). The box is kept elsewhere.
+template <class S>
+struct CellRecord {
+  S centre[3];             // of the posed image, metres
+  S inverse[9], reach[3];  // NaN for a cell whose transforms are not finite: it has no root
+  S curvature;
+};
+
+// Uniform bins over the posed boxes of a pose's cells: those of level 0, and in each further level larger ones.
+struct PreparedLevel {
+  int32_t bins[3];
+  int64_t bins_before;  // in finer levels
+};
+
+constexpr int kMostLevels = 6;
+constexpr int kShareBits = 8;    // a place in a bin is known to 1/256 of its side
+constexpr int kCoarserBits = 2;  // a bin is four times as long as one of the level before
+
+template <class S>
+struct PreparedPose {
+  S lower[3], upper[3];  // of all boxes, metres
+  S shares_per_metre;    // 256 in a bin of level 0
+  int32_t levels;
+  PreparedLevel level[kMostLevels];
+  int64_t bins, groups;
+};
+
+// Cells of a bin, with their posed boxes in shares of the bin. What is not used has a lower corner above the upper one.
+struct BinGroup {
+  uint8_t lower[3][kBlock], upper[3][kBlock];
+  int32_t cell[kBlock];
+};
+
+// A pose whose cells are sorted into bins (prepared.h).
+template <class S>
+struct PreparedTask {
+  const S* transforms;  // of the pose, [V, 12]
+  Geometry<S> geometry;
+  const PreparedPose<S>* pose;
+  const int32_t* number;       // of each of the C cells in the grid, x fastest
+  const CellRecord<S>* cells;  // [C]
+  const int32_t* first;        // first group of each bin, [bins + 1]
+  const BinGroup* groups;
+  const S* points;  // [N, 3]
+  S tolerance;
+  int32_t max_steps;
+  bool orientation_preserving;
+};
+
 template <class S>
 struct BroydenTask {
   const S* transforms;  // of the pose, [V, 12]
@@ -126,6 +175,10 @@ struct Kernels {
   void (*boxes)(const S* transforms, const Geometry<S>&, const Block&, BlockBoxes<S>&);
   // Finds the roots in one block's cells.
   void (*search)(const CompleteTask<S>&, const Block&, const BlockBoxes<S>&, Scratch<S>&, RootSink<S>&);
+  // Bounds those of a block's cells that are searched: their records, and the half extents of their posed boxes, [3] each.
+  void (*bounds)(const S* transforms, const Geometry<S>&, const Block&, CellRecord<S>* cells, S* boxes);
+  // Finds the roots of the queries first to last of a prepared pose.
+  void (*search_prepared)(const PreparedTask<S>&, int64_t first, int64_t last, RootSink<S>&);
   // Runs Broyden's method for the queries first to last.
   void (*broyden)(const BroydenTask<S>&, int64_t first, int64_t last, RootSink<S>&);
   void (*backward)(const BackwardTask<S>&);

@@ -207,11 +207,11 @@ SNARF_HD void store(S* at, Lanes<S> value) {
   memcpy(at, &value.v, sizeof value.v);
 }
 
-// The numbers 0 to 11 of `width` rows as twelve packs, one lane per row.
-template <class S>
+// The first `count` numbers, a multiple of four, of `width` rows as so many packs, one lane per row.
+template <int count, class S>
 SNARF_HD void load_rows(const S* const* row, Lanes<S>* out) {
   constexpr int width = Lanes<S>::width;
-  for (int r = 0; r < 12; ++r) {
+  for (int r = 0; r < count; ++r) {
     S column[width];
     for (int i = 0; i < width; ++i) column[i] = row[i][r];
     out[r] = load<S>(column);
@@ -230,8 +230,9 @@ SNARF_HD Lanes<S> shifted(Lanes<S> a, S last) {
 
 #if defined(__AVX512F__) && defined(__GNUC__)
 // Four rows share a register, 128 bits each, in such an order that transposing within the 128 bits puts every row in its lane.
+template <int count>
 SNARF_HD void load_rows(const float* const* row, Lanes<float>* out) {
-  for (int r = 0; r < 12; r += 4) {
+  for (int r = 0; r < count; r += 4) {
     __m512 part[4];
     for (int i = 0; i < 4; ++i) {
       part[i] = _mm512_castps128_ps512(_mm_loadu_ps(row[i] + r));
@@ -254,8 +255,9 @@ SNARF_HD Lanes<float> shifted(Lanes<float> a, float last) {
   return {(Lanes<float>::Vector)_mm512_alignr_epi32(next, (__m512i)a.v, 1)};
 }
 #elif defined(__AVX2__) && defined(__GNUC__)
+template <int count>
 SNARF_HD void load_rows(const float* const* row, Lanes<float>* out) {
-  for (int r = 0; r < 12; r += 4) {
+  for (int r = 0; r < count; r += 4) {
     __m256 part[4];
     for (int i = 0; i < 4; ++i)
       part[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(row[i] + r)), _mm_loadu_ps(row[4 + i] + r), 1);

@@ -8,6 +8,7 @@
 #include "complete_search.h"
 #include "dispatch.h"
 #include "network.h"
+#include "prepared.h"
 #include "training.h"
 #include "roots.h"
 #include "snarf/api.h"
@@ -58,8 +59,6 @@ template <class S>
 void implicit_backward(const snarf_field& field, const snarf_queries& queries, int64_t roots, const S* gradient,
                        const S* canonical, const int64_t* query, const S* inverse, S* v_points, S* v_transforms) {
   const int64_t nodes = node_count(field), layers = field.nodes[2];
-  if (v_points) std::fill(v_points, v_points + 3 * queries.poses * queries.count, S(0));
-  if (v_transforms) std::fill(v_transforms, v_transforms + 12 * queries.poses * nodes, S(0));
   if (!roots || !queries.poses || !queries.count) return;
   const int threads = threads_for(queries, roots);
   // Each pose writes to separate nodes. Those of a pose are cut into layers, whose threads read the same roots in the same
@@ -171,6 +170,33 @@ int snarf_complete_search(const snarf_field* field, const snarf_queries* queries
                           snarf_roots** roots, int64_t* found) {
   if (!settings) return SNARF_BAD_ARGUMENT;
   return search_with(field, queries, roots, found, [&](auto& out) { complete_search(*field, *queries, *settings, out); });
+}
+
+int snarf_prepare(const snarf_field* field, int64_t poses, const uint8_t* active, int32_t threads, snarf_prepared** prepared,
+                  int64_t* bytes) {
+  const snarf_queries queries{nullptr, poses, 0, threads};
+  if (!valid(field, &queries) || !prepared || !bytes) return SNARF_BAD_ARGUMENT;
+  return in_number_type(field->bytes_per_number, [&](auto number) {
+    std::unique_ptr<snarf_prepared> out(new snarf_prepared());
+    prepare<decltype(number)>(*field, poses, active, threads, *out);
+    *bytes = out->bytes;
+    *prepared = out.release();
+  });
+}
+
+int snarf_take_prepared(snarf_prepared* prepared, void* buffer, void* boxes) {
+  const std::unique_ptr<snarf_prepared> owner(prepared);
+  if (!prepared || !buffer || !boxes) return SNARF_OK;
+  std::memcpy(buffer, owner->buffer.get(), size_t(owner->bytes));
+  return in_number_type(header_of(owner->buffer.get()).bytes_per_number,
+                        [&](auto number) { copy_boxes(owner->buffer.get(), static_cast<decltype(number)*>(boxes)); });
+}
+
+int snarf_prepared_search(const void* buffer, int64_t bytes, const snarf_field* field, const snarf_queries* queries,
+                          const snarf_complete* settings, snarf_roots** roots, int64_t* found) {
+  if (!valid(field, queries) || !settings || !fits(buffer, bytes, *field, queries->poses)) return SNARF_BAD_ARGUMENT;
+  return search_with(field, queries, roots, found,
+                     [&](auto& out) { prepared_search(static_cast<const char*>(buffer), *field, *queries, *settings, out); });
 }
 
 int snarf_broyden_search(const snarf_field* field, const snarf_queries* queries, const snarf_broyden* settings,

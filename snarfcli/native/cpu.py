@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from ctypes import Structure, byref, c_double, c_int32, c_int64, c_void_p
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -127,6 +128,53 @@ def complete_search(
     return fit_to_capacity(*found, points, capacity)
 
 
+def prepare_search(
+    transforms: Tensor, lower: Tensor, upper: Tensor, shape: Sequence[int], active_cells: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Sort the cells of poses by their images, for `prepared_search`.
+
+    Args:
+        transforms: [B, D * H * W, 12], blended transforms at the nodes; those that every search is given.
+
+    Returns:
+        A buffer, [K], uint8, and the corners of the box around the images of each pose, [B, 2, 3], metres.
+    """
+    library, transforms = _library(), transforms.contiguous()
+    active = None if active_cells is None else active_cells.contiguous()
+    field = _field(transforms, lower, upper, shape)
+    handle, size = c_void_p(), c_int64()
+    cells = None if active is None else c_void_p(active.data_ptr())
+    threads = c_int32(torch.get_num_threads())
+    _raise_for(library.snarf_prepare(byref(field), c_int64(len(transforms)), cells, threads, byref(handle), byref(size)))
+    try:
+        buffer, boxes = torch.empty(size.value, dtype=torch.uint8), transforms.new_empty(len(transforms), 2, 3)
+    except BaseException:
+        library.snarf_take_prepared(handle, None, None)
+        raise
+    library.snarf_take_prepared(handle, c_void_p(buffer.data_ptr()), c_void_p(boxes.data_ptr()))
+    return buffer, boxes
+
+
+def prepared_search(
+    points: Tensor,
+    transforms: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    shape: Sequence[int],
+    buffer: Tensor,
+    tolerance: float,
+    max_steps: int,
+    orientation_preserving: bool,
+    capacity: int | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Find the same roots as `complete_search` in the cells that `prepare_search` has sorted."""
+    points = points.contiguous()
+    settings = _Complete(None, tolerance * _longest_side(lower, upper), max_steps, orientation_preserving)
+    place = (c_void_p(buffer.data_ptr()), c_int64(len(buffer)))
+    found = _search("snarf_prepared_search", _field(transforms, lower, upper, shape), points, settings, place)
+    return fit_to_capacity(*found, points, capacity)
+
+
 def broyden_search(
     points: Tensor,
     transforms: Tensor,
@@ -170,8 +218,8 @@ def implicit_backward(
     """Return the gradients by the queries and by the transforms; see `ops.implicit_backward`."""
     gradient, canonical = gradient.contiguous(), canonical.contiguous()
     query, jacobian_inverse = query.contiguous(), jacobian_inverse.contiguous()
-    v_points = gradient.new_empty((batch, count, 3) if wants_points else 0)
-    v_transforms = gradient.new_empty((batch, shape[0] * shape[1] * shape[2], 12) if wants_transforms else 0)
+    v_points = gradient.new_zeros((batch, count, 3) if wants_points else 0)
+    v_transforms = gradient.new_zeros((batch, shape[0] * shape[1] * shape[2], 12) if wants_transforms else 0)
     field = _field(gradient, lower, upper, shape)
     queries = _Queries(None, batch, count, torch.get_num_threads())
     code = _library().snarf_implicit_backward(
@@ -247,11 +295,13 @@ def _field(numbers: Tensor, lower: Tensor, upper: Tensor, shape: Sequence[int]) 
     )
 
 
-def _search(function: str, field: _Field, points: Tensor, settings: Structure) -> tuple[Tensor, Tensor, Tensor]:
+def _search(
+    function: str, field: _Field, points: Tensor, settings: Structure, place: tuple[Any, ...] = ()
+) -> tuple[Tensor, Tensor, Tensor]:
     library = _library()
     queries = _Queries(points.data_ptr(), points.shape[0], points.shape[1], torch.get_num_threads())
     handle, found = c_void_p(), c_int64()
-    _raise_for(getattr(library, function)(byref(field), byref(queries), byref(settings), byref(handle), byref(found)))
+    _raise_for(getattr(library, function)(*place, byref(field), byref(queries), byref(settings), byref(handle), byref(found)))
     try:
         canonical = points.new_empty(found.value, 3)
         inverse = points.new_empty(found.value, 3, 3)

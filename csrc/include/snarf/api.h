@@ -16,7 +16,7 @@
 extern "C" {
 #endif
 
-#define SNARF_ABI_VERSION 4
+#define SNARF_ABI_VERSION 5
 
 enum { SNARF_OK = 0, SNARF_BAD_ARGUMENT = 1, SNARF_OUT_OF_MEMORY = 2 };
 
@@ -161,6 +161,7 @@ typedef struct snarf_variation {
 } snarf_variation;
 
 typedef struct snarf_roots snarf_roots;
+typedef struct snarf_prepared snarf_prepared;
 
 SNARF_API int snarf_abi_version(void);
 /* Name of the instruction set in use: avx512, avx2 or baseline. SNARF_INSTRUCTION_SET in the environment may ask for a lower
@@ -178,12 +179,23 @@ SNARF_API int snarf_complete_search(const snarf_field*, const snarf_queries*, co
 SNARF_API int snarf_broyden_search(const snarf_field*, const snarf_queries*, const snarf_broyden*, snarf_roots** roots,
                                    int64_t* found);
 
+/* Sorts the cells of poses by their posed images, for many complete searches with few queries each. The first call returns a
+ * handle and the size of a buffer; the second writes the buffer, the lower and upper corner of the box around the images of
+ * each pose, [B, 2, 3], metres (infinite if there is no cell to search), and frees the handle. Null pointers only free it. The
+ * buffer is plain data without pointers, aligned to 64 bytes, of this machine and this version of the library. */
+SNARF_API int snarf_prepare(const snarf_field*, int64_t poses, const uint8_t* active, int32_t threads, snarf_prepared**,
+                            int64_t* bytes);
+SNARF_API int snarf_take_prepared(snarf_prepared*, void* buffer, void* boxes);
+/* As `snarf_complete_search` in the prepared cells; `field` is that of the preparation and `active` is not read. */
+SNARF_API int snarf_prepared_search(const void* buffer, int64_t bytes, const snarf_field*, const snarf_queries*,
+                                    const snarf_complete*, snarf_roots** roots, int64_t* found);
+
 /* canonical [M, 3], query [M] (b N + n, ascending), jacobian_inverse [M, 3, 3]. Frees the handle; null pointers only free it.
  */
 SNARF_API int snarf_take_roots(snarf_roots* roots, void* canonical, int64_t* query, void* jacobian_inverse);
 
-/* Gradients of a loss by the queries [B, N, 3] and by the nodes' transforms [B, V, 12], from that by the roots, [M, 3]. Either
- * result may be null; both are overwritten. `field.transforms` is not read. */
+/* Gradients of a loss by the queries [B, N, 3] and by the nodes' transforms [B, V, 12], from that by the roots, [M, 3]; they
+ * are added to the results, of which either may be null. `field.transforms` is not read. */
 SNARF_API int snarf_implicit_backward(const snarf_field*, const snarf_queries*, int64_t roots, const void* gradient,
                                       const void* canonical, const int64_t* query, const void* jacobian_inverse, void* v_points,
                                       void* v_transforms);

@@ -101,11 +101,11 @@ SNARF_HD void bound_box(const Cell<V>& cell, V* box, S wide = S(0.5) + face_tole
   }
 }
 
-// All bounds of the cell, with the same slack.
+// Inverse of the Jacobian at the centre, posed metres to cell coordinates; zero where it is singular up to rounding. Returns
+// where it is not.
 template <class V, class S>
-SNARF_HD void bound_cell(const Cell<V>& cell, CellBounds<V>& out, S wide = S(0.5) + face_tolerance<S>()) {
+SNARF_HD auto centre_inverse(const Cell<V>& cell, V* inverse) {
   constexpr S epsilon = sizeof(S) == 4 ? S(1e-6) : S(1e-14);
-  bound_box<V, S>(cell, out.box, wide);
   V jacobian[9], adj[9];
   for (int i = 0; i < 3; ++i) {
     const V* c = cell.c + kMonomials * i;
@@ -115,12 +115,21 @@ SNARF_HD void bound_cell(const Cell<V>& cell, CellBounds<V>& out, S wide = S(0.5
   }
   V determinant = adjugate(jacobian, adj);
   V zero = determinant * S(0);
-  // A Jacobian that is singular up to rounding gives no bound on roots.
   V scale = zero + epsilon;
   for (int axis = 0; axis < 3; ++axis) scale = scale * longest_of(jacobian[axis], jacobian[3 + axis], jacobian[6 + axis]);
   auto regular = absolute(determinant) > scale;
   V reciprocal = select(regular, zero + S(1), zero) / select(regular, determinant, zero + S(1));
-  for (int k = 0; k < 9; ++k) out.inverse[k] = adj[k] * reciprocal;
+  for (int k = 0; k < 9; ++k) inverse[k] = adj[k] * reciprocal;
+  return regular;
+}
+
+// All bounds of the cell, with the same slack. A Jacobian that is singular gives no bound on roots.
+template <class V, class S>
+SNARF_HD void bound_cell(const Cell<V>& cell, CellBounds<V>& out, S wide = S(0.5) + face_tolerance<S>()) {
+  constexpr S epsilon = sizeof(S) == 4 ? S(1e-6) : S(1e-14);
+  bound_box<V, S>(cell, out.box, wide);
+  const auto regular = centre_inverse<V, S>(cell, out.inverse);
+  const V zero = out.box[0] * S(0);
   out.curvature = zero;
   for (int i = 0; i < 3; ++i) {
     const V* row = out.inverse + 3 * i;

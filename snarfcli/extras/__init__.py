@@ -6,21 +6,33 @@ from importlib.util import find_spec
 
 from snarfcli.errors import UserError
 
-__all__ = ["MissingPackage", "require_packages"]
+__all__ = ["MissingPackage", "missing_packages", "require_packages"]
+
+# The packages that are imported with the modules that use them, by the name of the module; others are imported when needed.
+_PACKAGES = {
+    "commands": {
+        "filelock": "filelock",
+        "hydra": "hydra-core",
+        "igl": "libigl",
+        "PIL": "pillow",
+        "scipy": "scipy",
+        "skimage": "scikit-image",
+    }
+}
 
 
 class MissingPackage(UserError, ImportError):
     """A package that an optional part of the library needs is not installed; the message names the extra that brings it."""
 
 
-def require_packages(extra: str, packages: dict[str, str]) -> None:
-    """Raise `MissingPackage` unless all packages of an extra are installed. None of them is imported.
+def missing_packages(extra: str) -> list[str]:
+    """Return the packages of an extra that are not installed. None of them is imported."""
+    return [package for module, package in _PACKAGES[extra].items() if find_spec(module) is None]
 
-    Args:
-        extra: name of the extra, as in `pip install 'snarf[commands]'`.
-        packages: names of packages by the module that each is imported as.
-    """
-    missing = [package for module, package in packages.items() if find_spec(module) is None]
+
+def require_packages(extra: str) -> None:
+    """Raise `MissingPackage` unless the packages of an extra, as in `pip install 'snarf[commands]'`, are installed."""
+    missing = missing_packages(extra)
     if missing:
         raise MissingPackage(
             f"this part of snarf needs packages that are not installed ({', '.join(missing)}); "

@@ -12,8 +12,9 @@ import pytest
 from light_install import hidden_modules, run_light
 from smpl_files import smpl, write_pickle
 
+from snarfcli import extras
 from snarfcli.errors import UserError
-from snarfcli.extras import MissingPackage, require_packages
+from snarfcli.extras import MissingPackage
 
 ROOT = Path(__file__).parents[2]
 INSTALL = "pip install 'snarf[commands]'"
@@ -83,8 +84,16 @@ for module in pkgutil.walk_packages(snarfcli.__path__, "snarfcli.", onerror=lamb
     assert set(done.stdout.split()) == rooms | {"extras", "samples", "sampling", "training", "viewer"}
 
 
-def test_a_public_name_says_what_to_install():
-    done = run_light("from snarfcli import Avatar")
+def test_public_names_say_what_to_install():
+    code = """
+import snarf
+from snarf import *
+
+assert "load_body" in snarf.__all__ and "Avatar" not in snarf.__all__
+assert not [name for name in dir(snarf) if not hasattr(snarf, name)]  # as help() needs it
+import snarf.motions
+"""
+    done = run_light(code)
     last = done.stderr.splitlines()[-1]
     assert last.startswith("snarfcli.extras.MissingPackage: this part of snarf needs packages that are not installed (")
     assert "libigl" in last
@@ -105,9 +114,10 @@ assert [main(arguments) for arguments in (["train", "subject=50002"], ["eval", "
         assert line.endswith(INSTALL)
 
 
-def test_the_error_is_a_user_error_and_an_import_error():
+def test_the_error_is_a_user_error_and_an_import_error(monkeypatch):
+    monkeypatch.setattr(extras, "_PACKAGES", {"name": {"json": "a-package", "no_such_module_b": "b-package"}})
     with pytest.raises(MissingPackage, match=r"\(b-package\); install them with: pip install 'snarf\[name\]'") as caught:
-        require_packages("name", {"json": "a-package", "no_such_module_b": "b-package"})
+        extras.require_packages("name")
     assert isinstance(caught.value, UserError)
     assert isinstance(caught.value, ImportError)
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)

@@ -22,8 +22,8 @@ LAYERS = (
     ("export", "rendering", "samples"),
     ("datasets", "meshing"),
     ("models", "motions"),
-    ("bodies", "deformer", "shape"),
-    ("networks",),
+    ("deformer", "shape"),
+    ("bodies", "networks"),
     (
         "array_files",
         "checks",

@@ -44,6 +44,7 @@ points = body.v_template[None, ::100]
 found = deformer(points, transforms)
 assert bool(found.found.all())
 found.canonical.sum().backward()
+assert ForwardDeformer.from_body({str(body)!r}, resolution=(9, 9, 5)).body.vertices.shape == (6890, 3)
 weights = PresetWeights.from_vertices(body.v_template, body.weights, grid, shape).at_nodes().reshape(*shape, 24)
 assert bool(find_correspondences(points, transforms, weights, grid).found.all())
 left = {sorted(hidden_modules())!r}

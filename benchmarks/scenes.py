@@ -14,10 +14,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from snarfcli.bodies import axis_angle_to_matrix
+from snarfcli.bodies.extent import weight_segments
 from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.deformer import CanonicalGrid
-from snarfcli.models.extent import weight_segments
 from snarfcli.motions import builtin_motion
 from snarfcli.sampling import sampling_cube, winding_numbers
 from snarfcli.segments import segment_distances

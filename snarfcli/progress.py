@@ -7,6 +7,7 @@ import logging
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sized
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 from snarfcli.texts import one_line
@@ -46,12 +47,12 @@ def progress(items: Iterable[_Item], *, total: int | None = None, desc: str, uni
 
 @contextlib.contextmanager
 def progress_bar(*, total: int | None, done: int = 0, desc: str, unit: str) -> Iterator[Any]:
-    """Yield a bar of tqdm on a terminal, else None; see `progress`.
+    """Yield a bar of tqdm on a terminal, else None, also if tqdm is not installed; see `progress`.
 
     Args:
         done: number of items that were done before.
     """
-    if sys.stderr is None or not sys.stderr.isatty():
+    if sys.stderr is None or not sys.stderr.isatty() or find_spec("tqdm") is None:
         yield None
         return
     from tqdm import tqdm

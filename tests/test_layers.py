@@ -22,8 +22,8 @@ LAYERS = (
     ("export", "rendering", "samples"),
     ("datasets", "meshing"),
     ("models", "motions"),
-    ("bodies", "deformer", "shape"),
-    ("networks",),
+    ("deformer", "shape"),
+    ("bodies", "networks"),
     (
         "array_files",
         "checks",
@@ -39,7 +39,7 @@ LAYERS = (
         "sampling",
         "segments",
     ),
-    ("files", "locks"),
+    ("extras", "files", "locks"),
     ("errors", "interrupts", "names", "safe_start", "texts", "versions"),
 )
 """Folders and top-level modules of the package, from the top layer down; those of one layer do not import each other."""

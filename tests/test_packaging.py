@@ -60,12 +60,13 @@ def test_the_wheel_holds_what_is_needed_at_run_time(wheel, tmp_path):
     configuration = {f"snarfcli/conf/{path.relative_to(ROOT / 'conf').as_posix()}" for path in (ROOT / "conf").rglob("*.yaml")}
     kernels = [path for folder in ("include/snarf", "cuda") for path in (ROOT / "csrc" / folder).iterdir()]
     sources = {f"snarfcli/{path.relative_to(ROOT).as_posix()}" for path in kernels}
-    modules = {path.relative_to(ROOT).as_posix() for path in (ROOT / "snarfcli").rglob("*.py")}
+    modules = {path.relative_to(ROOT).as_posix() for name in ("snarf", "snarfcli") for path in (ROOT / name).rglob("*.py")}
     assert configuration
     assert sources
-    assert configuration | sources | modules | {"snarfcli/bodies/body_cc0.npz", "snarfcli/py.typed"} <= names
+    others = {"snarf/py.typed", "snarfcli/py.typed", "snarfcli/bodies/body_cc0.npz"}
+    assert configuration | sources | modules | others <= names
     assert [name for name in names if "libsnarf_native" in name] == [_native_name()]
-    assert all(name.startswith(("snarfcli/", "snarf-")) for name in names)
+    assert all(name.startswith(("snarf/", "snarfcli/", "snarf-")) for name in names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".o", ".a", ".cpp"))]
 
 
@@ -80,7 +81,8 @@ def test_the_wheel_runs_from_anywhere(wheel, tmp_path):
     (stated,) = re.findall(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     done = run_from(
         tmp_path,
-        f"assert snarfcli.__version__ == {stated!r}; "
+        f"assert snarfcli.__version__ == {stated!r}; import snarf; assert {str(tmp_path)!r} in snarf.__file__; "
+        "from snarf.deformer import ForwardDeformer; assert ForwardDeformer is snarfcli.ForwardDeformer; "
         "from snarfcli.bodies import builtin_body; assert len(builtin_body().v_template) == 6890; "
         "from snarfcli.native.backend import choose_backend; from snarfcli.native.library import library_path; "
         f"assert choose_backend('native') == 'native' and {str(tmp_path)!r} in str(library_path()); "
@@ -127,7 +129,8 @@ def test_the_source_distribution_builds(tmp_path):
     (archive,) = tmp_path.glob("snarf-*.tar.gz")
     with tarfile.open(archive) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
-    wanted = [path for folder in ("csrc", "conf", "snarfcli", "tests") for path in (ROOT / folder).rglob("*") if path.is_file()]
+    folders = ("csrc", "conf", "snarf", "snarfcli", "tests")
+    wanted = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
     wanted = {path.relative_to(ROOT).as_posix() for path in wanted if "__pycache__" not in path.parts}
     assert wanted | {"CMakeLists.txt", "pyproject.toml", "README.md", "LICENSE", "Makefile", "tools/set_up.sh"} <= names
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -16,6 +15,7 @@ from snarfcli.array_files import read_npz
 from snarfcli.bodies.body import Body
 from snarfcli.bodies.skeleton import MAX_JOINTS, SMPL_JOINT_NAMES, SMPLH_JOINT_NAMES, SMPLX_JOINT_NAMES
 from snarfcli.errors import UserError
+from snarfcli.formats.pickle_numbers import SparseMatrix
 from snarfcli.formats.pickles import read_pickle
 
 __all__ = ["load_body"]
@@ -103,7 +103,7 @@ def _arrays(path: Path) -> dict[str, Any]:
         raise UserError(f"body {path} lacks {', '.join(missing)}; wanted {', '.join(_REQUIRED_KEYS)}")
     arrays = {key: content[key] for key in _KEYS if key in content}
     for key, array in arrays.items():
-        if key == "joint_names" or (key == "J_regressor" and scipy.sparse.issparse(array)):
+        if key == "joint_names" or (key == "J_regressor" and isinstance(array, SparseMatrix)):
             continue
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
             raise UserError(f"body {path}: {key}: wanted finite numbers, got others; copy or download the file again")
@@ -129,7 +129,7 @@ def _check_shapes(arrays: dict[str, Any], path: Path) -> tuple[int, int]:
     if not vertices[0] or not 0 < joints[0] <= MAX_JOINTS:
         wanted_counts = f"at least 1 vertex and 1 to {MAX_JOINTS:,} joints"
         raise UserError(f"body {path}: wanted {wanted_counts}, got {vertices[0]} and {joints[0]}; get another copy")
-    if scipy.sparse.issparse(arrays["J_regressor"]):
+    if isinstance(arrays["J_regressor"], SparseMatrix):
         arrays["J_regressor"] = arrays["J_regressor"].toarray()
     return vertices[0], joints[0]
 

@@ -1,9 +1,10 @@
-"""User errors as one line each. Hydra is imported when there is an error, since it takes a third of a second."""
+"""User errors as one line each."""
 
 from __future__ import annotations
 
 import errno
 import re
+import sys
 
 from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.texts import one_line
@@ -24,9 +25,6 @@ def user_message(error: BaseException) -> str | None:
 
 
 def _message(error: BaseException) -> str | None:
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
     chain = _chain(error)
     for link in chain:
         if isinstance(link, UserError):
@@ -36,9 +34,12 @@ def _message(error: BaseException) -> str | None:
             return _file_message(link)
         if is_out_of_memory(link):
             return _memory_message(link)
-    if isinstance(error, OmegaConfBaseException | HydraException):
-        return _config_message(chain)
-    return None
+    if "hydra" not in sys.modules:
+        return None  # nor any of its errors
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    return _config_message(chain) if isinstance(error, OmegaConfBaseException | HydraException) else None
 
 
 _NO_PERMISSION = "no permission; change its permissions, or name another place (output_root=..., data_root=... or output=...)"

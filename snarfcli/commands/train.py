@@ -18,11 +18,11 @@ from snarfcli.bodies import MeshTemplate
 from snarfcli.commands.train_settings import TrainConfig, check_settings
 from snarfcli.datasets.builtin import require_subject
 from snarfcli.deformer import CanonicalGrid
+from snarfcli.deformer.grid_sides import with_grid_sides
 from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, read_json, remove_temporaries, write_json
 from snarfcli.fitting import RefinedPoses, refined_poses_text
 from snarfcli.models.checkpoint import load_checkpoint
-from snarfcli.models.grid_sides import with_grid_sides
 from snarfcli.models.preset import read_preset_weights
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.shape_sizes import with_shape_sizes

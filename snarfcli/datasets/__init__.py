@@ -1,0 +1,1 @@
+import snarfcli.extras.commands  # noqa: F401 - raises MissingPackage

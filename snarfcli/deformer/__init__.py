@@ -3,6 +3,7 @@
 Usable alone, in any neural field: see `ForwardDeformer`.
 """
 
+from snarfcli.deformer.canonical_body import CanonicalBody
 from snarfcli.deformer.cells import cells_near
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.deformer import ForwardDeformer
@@ -17,6 +18,7 @@ from snarfcli.deformer.weights import BonePrior, NodeWeights, WeightField
 
 __all__ = [
     "BonePrior",
+    "CanonicalBody",
     "CanonicalGrid",
     "Correspondences",
     "ForwardDeformer",

@@ -20,15 +20,15 @@ def cells_near(grid: CanonicalGrid, shape: tuple[int, int, int], places: list[tu
     Args:
         grid: canonical box.
         shape: nodes (D, H, W).
-        places: pairs of segments [S, 2, 3], metres, and the largest distance that counts as near, metres. A point is a segment
-            of length 0.
+        places: pairs of segments [S, 2, 3] or points [S, 3], metres, and the largest distance that counts as near, metres.
     """
     nodes = grid.nodes(shape).reshape(-1, 3)
     near = torch.zeros(len(nodes), dtype=torch.bool, device=nodes.device)
-    for segments, radius in places:
-        for some in segments.split(_SEGMENTS_AT_ONCE):  # both bound the memory
+    for content, radius in places:
+        for some in content.split(_SEGMENTS_AT_ONCE):  # both bound the memory
             for part, part_near in zip(nodes.split(_NODES_AT_ONCE), near.split(_NODES_AT_ONCE), strict=True):
-                part_near |= distance_to_segments(part, some) < radius
+                distance = distance_to_segments(part, some) if some.ndim == 3 else torch.cdist(part, some).amin(1)
+                part_near |= distance < radius
     return torch.nn.functional.max_pool3d(near.reshape(1, 1, *shape).float(), 2, stride=1)[0, 0] > 0
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from snarfcli.deformer.canonical_body import CanonicalBody, canonical_body, weights_around
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.complete import posed_cell_boxes
 from snarfcli.deformer.correspondences import Correspondences
@@ -61,6 +62,8 @@ class ForwardDeformer(nn.Module):
     _active_nodes: Tensor
     _active_points: Tensor
     field: Callable[[Tensor], Tensor]
+    body: CanonicalBody | None = None
+    """The body that the deformer was made for by `from_body`; not part of the state."""
 
     def __init__(
         self,
@@ -97,6 +100,46 @@ class ForwardDeformer(nn.Module):
         self.set_active_cells(self.active_cells if active_cells is None else active_cells)
         self._frozen: Tensor | None = None
         self.register_load_state_dict_post_hook(_after_load)
+
+    @classmethod
+    def from_body(
+        cls,
+        body: object,
+        *,
+        betas: Tensor | Sequence[float] | None = None,
+        canonical_pose: Tensor | None = None,
+        resolution: Sequence[int] | None = None,
+        margin_m: Sequence[float] | None = None,
+        search: SearchConfig | str | None = None,
+        trainable: bool = False,
+    ) -> ForwardDeformer:
+        """Make a deformer for a body, with the body's weights. `deformer.body` has its canonical vertices and skeleton.
+
+        `deformer.body.posed_from_canonical(pose)` returns the bone transforms that the deformer takes. The box lies around the
+        body in the canonical pose, the cells near it are searched, and the weights are extended from the vertices to the grid.
+
+        Args:
+            body: path of a file in SMPL's format; a `Body`; or a mapping or an object with vertices [V, 3] (or v_template),
+                weights [V, J] (or lbs_weights), joints [J, 3] (or J_regressor [J, V]) and parents [J] (or kintree_table), such
+                as a model of the package smplx. Pose correctives are not used.
+            betas: [S], shape parameters, for a body that has shape directions.
+            canonical_pose: [J, 3], axis-angle relative to the body's rest pose, radians; None: the rest pose, with the legs 30
+                degrees outwards if the joints are SMPL's or named l_hip and r_hip.
+            resolution: grid nodes along x, y, z; None for as many as in `SkinningConfig`, distributed by the sides of the box.
+            margin_m: margin of the box along x, y, z, metres; None for those of `SkinningConfig` in proportion to the body.
+            search: as for the class.
+            trainable: whether the weights are trained, from those of the body on, as voxel weights.
+
+        Raises:
+            ValueError: an array is missing, or a shape, a number or a parent is not valid.
+            UserError: the file cannot be read.
+        """
+        content = canonical_body(body, betas=betas, canonical_pose=canonical_pose, resolution=resolution, margin_m=margin_m)
+        field = weights_around(content, trainable)
+        skinning = SkinningConfig(name="voxel" if trainable else "preset", resolution=list(content.shape[::-1]))
+        deformer = cls(content.grid, content.skeleton.num_joints, skinning, search, content.active_cells, field=field)
+        deformer.body = content
+        return deformer
 
     @property
     def search(self) -> SearchConfig:

@@ -290,8 +290,22 @@ class VoxelWeights(GridWeights):
         if self.is_symmetric:
             nodes = nodes | nodes.flip(2)
         size = CanonicalGrid(self.lower, self.upper, checked=True).cell_size(self.shape)
-        weights = harmonic(self.at_nodes().reshape(*self.shape, -1), nodes, size, _SOLVED).clamp_min(_LEAST_WEIGHT)
-        logits = self.softmax.invert(self.optimised(weights).log().reshape(-1, weights.shape[-1])) / self.sharpness
+        logits = self._logits_of(harmonic(self.at_nodes().reshape(*self.shape, -1), nodes, size, _SOLVED), _LEAST_WEIGHT)
         kept = self.optimised(nodes).reshape(-1)
         self.logits.copy_(torch.where(kept[:, None], self.logits, logits))
         return ~kept
+
+    @torch.no_grad()
+    def set_weights(self, weights: Tensor, least: float = _LEAST_WEIGHT) -> None:
+        """Start from given weights.
+
+        Args:
+            weights: [D, H, W, J], at the nodes, non-negative, rows sum to 1; symmetric if the field is.
+            least: smaller weights become this one, since a weight of zero has no gradient.
+        """
+        self.logits.copy_(self._logits_of(weights, least))
+
+    def _logits_of(self, weights: Tensor, least: float) -> Tensor:
+        """Return the logits at the optimised nodes for weights [D, H, W, J] at all nodes."""
+        logs = self.optimised(weights).clamp_min(least).log()
+        return self.softmax.invert(logs.reshape(-1, logs.shape[-1])) / self.sharpness

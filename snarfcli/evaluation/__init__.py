@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import snarfcli.extras.commands  # noqa: F401 - raises MissingPackage
 from snarfcli.evaluation.metrics import FrameMetrics, Summary, iou, summarise
 
 __all__ = ["FrameMetrics", "Summary", "iou", "summarise"]

@@ -5,19 +5,40 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from snarfcli.formats.pickle_tree import Call, PickleError, shown, text_of
 
-__all__ = ["SPARSE_FORMS", "checked_shape", "dtype_of", "make_array", "make_sparse", "select"]
+__all__ = ["SPARSE_FORMS", "SparseMatrix", "checked_shape", "dtype_of", "make_array", "make_sparse", "select"]
 
-SPARSE_FORMS = {"csc": scipy.sparse.csc_matrix, "csr": scipy.sparse.csr_matrix, "coo": scipy.sparse.coo_matrix}
+SPARSE_FORMS = ("csc", "csr", "coo")
+"""Formats of SciPy's sparse matrices that are read."""
 # Numbers and text. `O8` is the type of objects in Python 2.
 _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,6}|O[48]?)")
+
+
+@dataclass(frozen=True, eq=False)
+class SparseMatrix:
+    """The entries of a sparse matrix that SciPy wrote; they are read without SciPy."""
+
+    shape: tuple[int, int]
+    """Rows and columns."""
+    values: NDArray
+    """[K], numbers; those at one place are added."""
+    rows: NDArray
+    """[K], whole numbers."""
+    columns: NDArray
+    """[K], whole numbers."""
+
+    def toarray(self) -> NDArray:
+        """Return the matrix with its zeros. Look at `shape` first: a small file can state a huge one."""
+        array = np.zeros(self.shape, self.values.dtype)
+        np.add.at(array, (self.rows, self.columns), self.values)
+        return array
 
 
 def _make_dtype(code: Any, order: Any) -> np.dtype:
@@ -106,8 +127,8 @@ def select(source: Any, chosen: Any, shape: Any) -> NDArray:
     return source.ravel()[chosen.astype(np.int64)].reshape(shape)
 
 
-def make_sparse(form: str, shape: Any, data: Any, index: Sequence[Any]) -> Any:
-    """Return a SciPy sparse matrix.
+def make_sparse(form: str, shape: Any, data: Any, index: Sequence[Any]) -> SparseMatrix:
+    """Return a sparse matrix.
 
     Args:
         form: csc, csr or coo.
@@ -126,18 +147,19 @@ def make_sparse(form: str, shape: Any, data: Any, index: Sequence[Any]) -> Any:
         raise damaged
     if not isinstance(shape, tuple) or len(shape) != 2 or any(type(n) is not int or not 0 <= n < 2**31 for n in shape):
         raise damaged
-    # SciPy's native code does not check these numbers.
     if form == "coo":
         if any(len(part) != len(data) or not _are_within(part, size) for part, size in zip(index, shape, strict=True)):
             raise damaged
-        return SPARSE_FORMS[form]((data, tuple(index)), shape=shape)
+        return SparseMatrix(shape, data, *index)
     entries, starts = index[0], index[1].astype(np.int64)
     major, minor = shape if form == "csr" else shape[::-1]
     if len(starts) != major + 1 or starts[0] != 0 or (np.diff(starts) < 0).any():
         raise damaged
     if not starts[-1] == len(entries) == len(data) or not _are_within(entries, minor):
         raise damaged
-    return SPARSE_FORMS[form]((data, entries, starts), shape=shape)
+    counted = np.repeat(np.arange(major), np.diff(starts))
+    rows, columns = (counted, entries) if form == "csr" else (entries, counted)
+    return SparseMatrix(shape, data, rows, columns)
 
 
 def _are_within(array: NDArray, size: int) -> bool:

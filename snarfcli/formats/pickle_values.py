@@ -7,10 +7,17 @@ from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
-from snarfcli.formats.pickle_numbers import SPARSE_FORMS, checked_shape, dtype_of, make_array, make_sparse, select
+from snarfcli.formats.pickle_numbers import (
+    SPARSE_FORMS,
+    SparseMatrix,
+    checked_shape,
+    dtype_of,
+    make_array,
+    make_sparse,
+    select,
+)
 from snarfcli.formats.pickle_tree import Call, Name, PickleError, Raw, shown, text_of
 
 __all__ = ["KNOWN_NAMES", "Reading", "odd", "plain_data"]
@@ -218,7 +225,7 @@ class Reading:
         value = self.value(state["x"], depth)
         if isinstance(value, (bool, int, float)):
             return np.array(value)
-        if not isinstance(value, np.ndarray) and not scipy.sparse.issparse(value):
+        if not isinstance(value, (np.ndarray, SparseMatrix)):
             raise odd(name)
         return value
 
@@ -230,7 +237,7 @@ class Reading:
             self.spend(chosen.size * (source.itemsize + 8) + (0 if source.flags.c_contiguous else source.nbytes))
         return select(source, chosen, shape)
 
-    def make_sparse(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> Any:
+    def make_sparse(self, name: Name, args: tuple, state: Any, _: Call, depth: int) -> SparseMatrix:
         if not isinstance(state, dict):
             raise odd(name)
         keys = ("row", "col") if name.kind == "coo" else ("indices", "indptr")

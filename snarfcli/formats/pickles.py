@@ -37,8 +37,8 @@ def read_pickle(path: str | Path, what: str = "file") -> Any:
 
     Returns:
         dict, list, tuple, set, str, bytes, numbers, None, and NumPy arrays that own their memory. Strings of Python 2 are
-        decoded as latin1. A chumpy object becomes the array of its value, a sparse matrix that of SciPy in the same format, and
-        an array of objects the flat list of them.
+        decoded as latin1. A chumpy object becomes the array of its value, a sparse matrix of SciPy a `SparseMatrix`, and an
+        array of objects the flat list of them.
 
     Raises:
         UserError: the file is missing, is not a pickle, is damaged, or contains a class that plain data does not need; the

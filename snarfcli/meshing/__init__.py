@@ -1,5 +1,6 @@
 """Surfaces of fields and avatars: coarse-to-fine evaluation, marching cubes, posed and skinned meshes, mesh files."""
 
+import snarfcli.extras.commands  # noqa: F401 - raises MissingPackage
 from snarfcli.meshing.extract import EmptySurface, FullSurface, extract_surface
 from snarfcli.meshing.mesh import ExtractionStats, Mesh, vertex_normals
 from snarfcli.meshing.posed import SURFACES, posed_mesh

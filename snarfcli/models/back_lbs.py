@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
+from snarfcli.bodies.extent import weight_segments
 from snarfcli.deformer import BonePrior, CanonicalGrid
 from snarfcli.deformer.hierarchy import make_softmax
-from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, PosedNetwork, into_root_frame, invert_blended, move_with_bones
 from snarfcli.models.system import Found, pose_angles
 from snarfcli.shape import CONDITIONS

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
+from snarfcli.bodies.extent import bone_segments, weight_segments
 from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, NodeWeights, SearchConfig, cells_near
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.weights import VoxelWeights
-from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.pieces import floating_cells
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.symmetry import find_mirror

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
+from snarfcli.bodies.extent import weight_segments
 from snarfcli.bodies.kinematics import invert_rigid
 from snarfcli.deformer import CanonicalGrid, NodeWeights
 from snarfcli.deformer.skinning import skin
-from snarfcli.models.extent import weight_segments
 from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import FieldSamples, Found

@@ -7,7 +7,6 @@ from typing import cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -34,6 +33,8 @@ def floating_cells(
     Returns:
         [D-1, H-1, W-1], bool; and the number of pieces that do not belong to the subject.
     """
+    from scipy import ndimage  # here: a trained field is used without it
+
     found = ndimage.label(occupied.cpu().numpy(), np.ones((3, 3, 3)))
     labels, count = cast("tuple[NDArray[np.int32], int]", found)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)

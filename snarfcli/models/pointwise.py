@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
+from snarfcli.bodies.extent import bone_segments
 from snarfcli.deformer import CanonicalGrid, NodeWeights
-from snarfcli.models.extent import bone_segments
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import FieldSamples, Found, System
 from snarfcli.precision import matmul_precision

@@ -7,7 +7,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton
-from snarfcli.models.extent import bone_segments
+from snarfcli.bodies.extent import bone_segments
 from snarfcli.segments import distance_to_segments
 from snarfcli.shape import ShapeConfig
 

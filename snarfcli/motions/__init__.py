@@ -1,5 +1,6 @@
 """Pose sequences: readers for motion files, retargeting, and the built-in motions."""
 
+import snarfcli.extras.commands  # noqa: F401 - raises MissingPackage
 from snarfcli.motions.body_shape import read_shape
 from snarfcli.motions.builtin import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, builtin_motion
 from snarfcli.motions.motion import Motion

@@ -1,5 +1,6 @@
 """Labelled points of posed meshes."""
 
+import snarfcli.extras.commands  # noqa: F401 - raises MissingPackage
 from snarfcli.sampling.cube import CUBE_PADDING, dequantise, pack_vertices, quantise, sampling_cube, unpack_vertices
 from snarfcli.sampling.occupancy import (
     INSIDE_TESTS,

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from snarfcli.bodies.extent import unpose_by_nearest_bone
 from snarfcli.errors import UserError
-from snarfcli.models.extent import unpose_by_nearest_bone
 from snarfcli.samples.store import SampleStore
 
 __all__ = ["rough_canonical_points"]

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from snarfcli.bodies.extent import bone_owners, bone_segments
 from snarfcli.deformer import NodeWeights
 from snarfcli.descriptions import DescriptionError, check_plain
 from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.evaluation.metrics import iou
 from snarfcli.fitting import PoseRefiner, require_refinable
-from snarfcli.models.extent import bone_owners, bone_segments
 from snarfcli.models.fast_snarf import FastSnarf
 from snarfcli.models.file_tensors import load_state, read_state, read_tensor
 from snarfcli.models.system import Found

@@ -13,6 +13,7 @@ import torch
 from toy_animal import ANIMAL_CLIPS, Animal, AnimalMotion, animal_motion, make_animal
 from toy_animal_files import animal_glb, write_animal_bvh, write_animal_meshes, write_mesh
 
+from snarfcli.bodies.extent import bone_owners, bone_segments, weight_segments
 from snarfcli.datasets import meshes
 from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.datasets.settings import DataConfig
@@ -20,7 +21,6 @@ from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.deformer.weights import BonePrior
 from snarfcli.errors import UserError
-from snarfcli.models.extent import bone_owners, bone_segments, weight_segments
 from snarfcli.samples.preprocessing import preprocess_subject
 from snarfcli.samples.store import SampleStore
 from snarfcli.samples.stored_motion import stored_motion

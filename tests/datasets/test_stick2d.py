@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay, cKDTree
 
+from snarfcli.bodies.extent import bone_segments
 from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.stick2d import STICK_STEPS_DEG, STICK_SUBJECTS, stick_subject, stick_weights
 from snarfcli.errors import UserError
-from snarfcli.models.extent import bone_segments
 from snarfcli.samples.preprocessing import preprocess_subject
 from snarfcli.samples.store import SampleStore
 from snarfcli.sampling import SamplingSettings, check_mesh

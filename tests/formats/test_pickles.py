@@ -85,8 +85,14 @@ def test_sparse_matrices(protocol, form, tmp_path):
     for kind in ("matrix", "array"):
         matrix = getattr(scipy.sparse, f"{form}_{kind}")(dense)
         got = read(pickle.dumps(matrix, protocol), tmp_path)
-        assert isinstance(got, getattr(scipy.sparse, f"{form}_matrix"))
+        assert got.shape == dense.shape
+        assert got.toarray().dtype == dense.dtype
         np.testing.assert_array_equal(got.toarray(), dense)
+
+
+def test_entries_of_a_sparse_matrix_at_one_place_are_added(tmp_path):
+    matrix = scipy.sparse.coo_matrix((np.array([1.0, 2, 4]), (np.array([1, 0, 1]), np.array([2, 0, 2]))), (2, 3))
+    np.testing.assert_array_equal(read(pickle.dumps(matrix, 2), tmp_path).toarray(), [[2, 0, 0], [0, 0, 5]])
 
 
 @pytest.mark.parametrize("protocol", [0, 1, 2])

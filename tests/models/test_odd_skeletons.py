@@ -9,12 +9,12 @@ from toy_subject import capsule_mesh
 from toy_training import avatar_config, new_avatar, training_config
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton
+from snarfcli.bodies.extent import bone_segments
 from snarfcli.datasets.posed_meshes import RigMeshes
 from snarfcli.datasets.subjects import SequenceSpec, SubjectData
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.meshing.posed import posed_mesh
-from snarfcli.models.extent import bone_segments
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.motions import Motion
 from snarfcli.samples.preprocessing import preprocess_subject

@@ -11,10 +11,10 @@ import torch
 from toy_training import avatar_config, new_avatar, toy_store, training_config
 
 from snarfcli.avatar import Avatar
+from snarfcli.bodies.extent import unpose_by_nearest_bone
 from snarfcli.errors import UserError
 from snarfcli.interrupts import SIGNALS, exit_code
 from snarfcli.models.checkpoint import load_checkpoint
-from snarfcli.models.extent import unpose_by_nearest_bone
 from snarfcli.training.loop import train
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Trainer
 

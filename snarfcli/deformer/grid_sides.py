@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton
-from snarfcli.deformer import SkinningConfig
+from snarfcli.deformer.skinning_config import SkinningConfig
 
 __all__ = ["with_grid_sides"]
 

@@ -8,7 +8,7 @@ import torch
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton
 from snarfcli.deformer import SkinningConfig
-from snarfcli.models.grid_sides import with_grid_sides
+from snarfcli.deformer.grid_sides import with_grid_sides
 
 OTHER = Skeleton(("a", "b"), (-1, 0), torch.zeros(2, 3), torch.zeros(2, 3))
 

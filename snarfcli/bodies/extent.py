@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from snarfcli.bodies import Skeleton
+from snarfcli.bodies.skeleton import Skeleton
 
 __all__ = ["bone_owners", "bone_segments", "unpose_by_nearest_bone", "weight_segments"]
 

@@ -1,0 +1,1 @@
+"""The package `snarfcli.export`, for tools that read code without running it."""

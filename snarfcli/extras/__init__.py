@@ -1,0 +1,40 @@
+"""The optional parts of the installation, and the error for packages that are missing."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from snarfcli.errors import UserError
+
+__all__ = ["MissingPackage", "missing_packages", "require_packages"]
+
+# The packages that are imported with the modules that use them, by the name of the module; others are imported when needed.
+_PACKAGES = {
+    "commands": {
+        "filelock": "filelock",
+        "hydra": "hydra-core",
+        "igl": "libigl",
+        "PIL": "pillow",
+        "scipy": "scipy",
+        "skimage": "scikit-image",
+    }
+}
+
+
+class MissingPackage(UserError, ImportError):
+    """A package that an optional part of the library needs is not installed; the message names the extra that brings it."""
+
+
+def missing_packages(extra: str) -> list[str]:
+    """Return the packages of an extra that are not installed. None of them is imported."""
+    return [package for module, package in _PACKAGES[extra].items() if find_spec(module) is None]
+
+
+def require_packages(extra: str) -> None:
+    """Raise `MissingPackage` unless the packages of an extra, as in `pip install 'snarf[commands]'`, are installed."""
+    missing = missing_packages(extra)
+    if missing:
+        raise MissingPackage(
+            f"this part of snarf needs packages that are not installed ({', '.join(missing)}); "
+            f"install them with: pip install 'snarf[{extra}]'"
+        )

@@ -385,21 +385,10 @@ def _parts_of_cells(grid: CanonicalGrid, shape: tuple[int, int, int]) -> list[in
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:
     """Blend logits [M] over the correspondences of each query to [B, N], so that each of them gets a gradient.
 
-    The weights are a softmax over the roots of a query, so that the result does not depend on how the roots were found.
-    A query without a root gets `NO_CORRESPONDENCE`.
-
-    Source: SNARF Sec. 3.2 (after Eq. 9); the form on logits is ours, and keeps its gradient where occupancies saturate.
+    A query without a root gets `NO_CORRESPONDENCE`. The papers blend probabilities; the form on logits is ours, and keeps its
+    gradient where occupancies saturate.
     """
-    values = logits if config.blend == "logit" else logits.sigmoid()
-    scores = config.blend_sharpness * values
-    total = found.batch * found.count
-    # One row more than queries, for the padding of a search with a capacity, which belongs to no query.
-    zeros = logits.new_zeros(total + 1)
-    highest = zeros.scatter_reduce(0, found.query, scores.detach(), "amax", include_self=False)
-    weights = (scores - highest[found.query]).exp()
-    norm = zeros.index_add(0, found.query, weights)
-    mean = (zeros.index_add(0, found.query, weights * values) / norm.clamp_min(1e-12))[:total]
-    mask = found.found.reshape(-1)
-    if config.blend == "probability":
-        mean = torch.logit(mean, eps=1e-6)
-    return torch.where(mask, mean, NO_CORRESPONDENCE).reshape(found.batch, found.count)
+    if config.blend == "logit":
+        return found.blend(logits, config.blend_sharpness, NO_CORRESPONDENCE)
+    mean = found.blend(logits.sigmoid(), config.blend_sharpness, 0.0)
+    return torch.where(found.found, torch.logit(mean, eps=1e-6), NO_CORRESPONDENCE)

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, NodeWeights, SearchConfig, cells_near
 from snarfcli.deformer.cells import corners_of
+from snarfcli.deformer.skinning import skin
 from snarfcli.deformer.weights import VoxelWeights
 from snarfcli.models.extent import bone_segments, weight_segments
 from snarfcli.models.pieces import floating_cells
@@ -328,8 +329,7 @@ class FastSnarf(System):
         canonical = self.deformer.random_canonical(count, generator)
         # without `weights`, the field itself at the points: to interpolate it, it would be evaluated at every node
         chosen = self.deformer.field(canonical) if weights is None else weights.at(canonical)
-        blended = torch.einsum("nj,bjrc->bnrc", chosen, bone_transforms[:, :, :3])
-        return (blended[..., :3] * canonical[:, None]).sum(-1) + blended[..., 3]
+        return skin(canonical, chosen, bone_transforms)
 
     def freeze(self) -> None:
         """Evaluate the skinning weights at the grid's nodes once and keep them.

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
-from snarfcli.deformer import CanonicalGrid, NodeWeights
+from snarfcli.deformer import CanonicalGrid, NodeWeights, inverse_skin
 from snarfcli.models.extent import bone_segments
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import FieldSamples, Found, System
@@ -161,24 +161,8 @@ def move_with_bones(points: Tensor, owner: Tensor, bone_transforms: Tensor) -> T
 
 
 def invert_blended(points: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
-    """Move posed points back by linear blend skinning with given weights: the inverse of SNARF Eq. 4 for fixed w.
+    """Move posed points [B, N, 3] back by linear blend skinning with given weights [B, N, J], see `inverse_skin`.
 
-    Blends of opposite rotations have no inverse. Near them the determinant is kept away from zero, so that points go far away
-    but stay finite.
-
-    Args:
-        points: [B, N, 3], posed, metres.
-        weights: [B, N, J], rows sum to 1.
-        bone_transforms: [B, J, 4, 4], canonical to posed.
-
-    Returns:
-        [B, N, 3], canonical, metres.
+    Blends of opposite rotations have no inverse. Near them points go far away but stay finite.
     """
-    blended = (weights @ bone_transforms[:, :, :3].flatten(2)).unflatten(2, (3, 4))
-    a, b, c = blended[..., :3].unbind(-2)
-    columns = [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)]
-    determinant = (a * columns[0]).sum(-1, keepdim=True)
-    least = torch.where(determinant < 0, -_LEAST_DETERMINANT, _LEAST_DETERMINANT)
-    determinant = torch.where(determinant.abs() < _LEAST_DETERMINANT, least, determinant)
-    offset = points - blended[..., 3]
-    return sum(column * offset[..., axis, None] for axis, column in enumerate(columns)) / determinant
+    return inverse_skin(points, weights, bone_transforms, _LEAST_DETERMINANT)

@@ -15,7 +15,7 @@ from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinea
 from snarfcli.deformer.harmonic import harmonic
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
 from snarfcli.deformer.skinning import interpolate
-from snarfcli.networks import ACTIVATIONS, run_perceptron
+from snarfcli.networks import ACTIVATIONS, WeightNormLinear, run_perceptron
 from snarfcli.segments import segment_distances
 
 __all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWeights", "WeightField"]
@@ -124,7 +124,7 @@ class NetworkWeights(WeightField):
             nn.init.normal_(layers[-1].weight, 0, 1e-4)
             nn.init.zeros_(layers[-1].bias)
         if weight_norm:
-            layers = [nn.utils.parametrizations.weight_norm(layer) for layer in layers]
+            layers = [WeightNormLinear(layer) for layer in layers]
         self.layers = nn.ModuleList(layers)
         self.softmax = softmax
         self.sharpness = sharpness

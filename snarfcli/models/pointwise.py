@@ -15,6 +15,7 @@ from snarfcli.deformer import CanonicalGrid, NodeWeights, inverse_skin
 from snarfcli.models.extent import bone_segments
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import FieldSamples, Found, System
+from snarfcli.networks import WeightNormLinear
 from snarfcli.precision import matmul_precision
 from snarfcli.segments import distance_to_segments
 from snarfcli.shape import OccupancyNetwork
@@ -123,12 +124,10 @@ class PosedNetwork(nn.Module):
             nn.init.normal_(layers[-1].weight, 0, 1e-4)
             nn.init.zeros_(layers[-1].bias)
         if config.skinning.weight_norm:
-            for layer in layers:
-                nn.utils.parametrizations.weight_norm(layer)
+            layers = [WeightNormLinear(layer) for layer in layers]
             if starts_at_zero:  # small by its length alone: the first step would turn a short direction to anywhere
                 with torch.no_grad():
-                    direction = layers[-1].get_parameter("parametrizations.weight.original1")
-                    direction.mul_(1e4 / config.skinning.width**0.5)
+                    layers[-1].direction.mul_(1e4 / config.skinning.width**0.5)
         self.layers = nn.ModuleList(layers)
         self.register_buffer("scale", torch.tensor(float(scale)))
 

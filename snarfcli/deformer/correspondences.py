@@ -11,9 +11,12 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree  # torch.export's documentation names it; there is no public module in all versions
 
+from snarfcli.field_docs import documented
+
 __all__ = ["Correspondences"]
 
 
+@documented
 @dataclass(frozen=True)
 class Correspondences:
     """Canonical correspondences of B x N posed points: the roots of all queries in one list.

@@ -15,6 +15,7 @@ from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinea
 from snarfcli.deformer.harmonic import harmonic
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
 from snarfcli.deformer.skinning import interpolate
+from snarfcli.field_docs import documented
 from snarfcli.networks import ACTIVATIONS, WeightNormLinear, run_perceptron
 from snarfcli.segments import segment_distances
 
@@ -36,6 +37,7 @@ class WeightField(nn.Module):
         """Update the canonical box, after the deformer has loaded another from a state."""
 
 
+@documented
 @dataclass(frozen=True)
 class NodeWeights:
     """Skinning weights at the grid nodes, evaluated once and used by a search and by what follows it."""

@@ -40,7 +40,7 @@ LAYERS = (
         "segments",
     ),
     ("extras", "files", "locks"),
-    ("errors", "interrupts", "names", "safe_start", "texts", "versions"),
+    ("errors", "field_docs", "interrupts", "names", "safe_start", "texts", "versions"),
 )
 """Folders and top-level modules of the package, from the top layer down; those of one layer do not import each other."""
 

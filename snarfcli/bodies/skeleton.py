@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.bodies.kinematics import forward_kinematics, invert_rigid
+from snarfcli.field_docs import documented
 
 __all__ = [
     "CANONICAL_HIP_RAD",
@@ -69,6 +70,7 @@ def _other_side(name: str) -> str:
     return _SIDE.sub(lambda match: _SIDES[match[0]], name, count=1)
 
 
+@documented
 @dataclass(frozen=True, eq=False)
 class Skeleton:
     """A joint tree with its rest joints and its canonical pose."""

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
+from snarfcli.field_docs import documented
+
 __all__ = ["MeshTemplate"]
 
 
+@documented
 @dataclass(frozen=True, eq=False)
 class MeshTemplate:
     """Ground-truth mesh and skinning weights, for evaluation, for pictures, and for systems that are trained with them."""

@@ -12,7 +12,7 @@ from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.grid_search import find_correspondences
 from snarfcli.deformer.search_config import SearchConfig
-from snarfcli.deformer.skinning import blend_transforms, skin
+from snarfcli.deformer.skinning import blend_transforms, blended_matrices, inverse_skin, skin
 from snarfcli.deformer.skinning_config import SkinningConfig
 from snarfcli.deformer.weights import BonePrior, NodeWeights, WeightField
 
@@ -28,8 +28,10 @@ __all__ = [
     "SkinningConfig",
     "WeightField",
     "blend_transforms",
+    "blended_matrices",
     "cells_near",
     "find_correspondences",
     "find_correspondences_on_field",
+    "inverse_skin",
     "skin",
 ]

@@ -8,12 +8,15 @@ from dataclasses import InitVar, dataclass
 import torch
 from torch import Tensor
 
+from snarfcli.field_docs import documented
+
 __all__ = ["CORNERS", "CanonicalGrid", "cell_corners", "locate", "trilinear_weights"]
 
 # Corner k of a cell lies at (k & 1, k >> 1 & 1, k >> 2 & 1) along (x, y, z).
 CORNERS = torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])
 
 
+@documented
 @dataclass(frozen=True)
 class CanonicalGrid:
     """An axis-aligned box in canonical space whose outermost grid nodes lie on its corners.

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from snarfcli.field_docs import documented
+
 __all__ = ["Roots", "drop_duplicates", "invert_3x3"]
 
 
+@documented
 @dataclass
 class Roots:
     """Roots of d(x) = x' for the queries of several poses, before gradients are attached."""

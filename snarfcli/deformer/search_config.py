@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from snarfcli.field_docs import documented
 from snarfcli.native.backend import BACKENDS
 
 __all__ = ["BACKENDS", "JACOBIANS", "SEARCHES", "SearchConfig", "as_search_config", "check_search_config"]
@@ -15,8 +16,11 @@ JACOBIANS = ("exact", "broyden")
 """Inverse Jacobians at the roots of a broyden search."""
 
 
+@documented
 @dataclass
 class SearchConfig:
+    """Settings of a correspondence search."""
+
     name: str = "complete"
     """Which search: complete (cell by cell, without start bones) or broyden (the papers')."""
     init_bones: list[int] | None = None

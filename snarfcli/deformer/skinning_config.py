@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from snarfcli.field_docs import documented
+
 __all__ = ["FIELDS", "SkinningConfig"]
 
 FIELDS = ("distilled", "voxel", "mlp", "preset")
 """Names of the weight fields."""
 
 
+@documented
 @dataclass
 class SkinningConfig:
+    """Settings of the skinning weights and of the grid that they are evaluated on."""
+
     name: str = "distilled"
     """Weight field: distilled (a network evaluated at the grid nodes), voxel (optimised at the nodes), mlp (a network that is
     searched directly, as in SNARF) or preset (given, not trained)."""

@@ -15,7 +15,8 @@ from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinea
 from snarfcli.deformer.harmonic import harmonic
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
 from snarfcli.deformer.skinning import interpolate
-from snarfcli.networks import ACTIVATIONS, run_perceptron
+from snarfcli.field_docs import documented
+from snarfcli.networks import ACTIVATIONS, WeightNormLinear, run_perceptron
 from snarfcli.segments import segment_distances
 
 __all__ = ["BonePrior", "GridWeights", "NetworkWeights", "NodeWeights", "VoxelWeights", "WeightField"]
@@ -36,6 +37,7 @@ class WeightField(nn.Module):
         """Update the canonical box, after the deformer has loaded another from a state."""
 
 
+@documented
 @dataclass(frozen=True)
 class NodeWeights:
     """Skinning weights at the grid nodes, evaluated once and used by a search and by what follows it."""
@@ -124,7 +126,7 @@ class NetworkWeights(WeightField):
             nn.init.normal_(layers[-1].weight, 0, 1e-4)
             nn.init.zeros_(layers[-1].bias)
         if weight_norm:
-            layers = [nn.utils.parametrizations.weight_norm(layer) for layer in layers]
+            layers = [WeightNormLinear(layer) for layer in layers]
         self.layers = nn.ModuleList(layers)
         self.softmax = softmax
         self.sharpness = sharpness

@@ -12,6 +12,7 @@ from snarfcli.errors import UserError
 from snarfcli.export.deviation import Deviation
 from snarfcli.export.morphs import ShapeBasis
 from snarfcli.export.rig import LocalTransforms
+from snarfcli.field_docs import documented
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.posed import RESOLUTIONS
 
@@ -22,6 +23,7 @@ TRIANGLES = (100, 5_000_000)
 MORPH_TARGETS = (0, 64)
 
 
+@documented
 @dataclass(frozen=True)
 class CharacterOptions:
     """Limits on the size of a character."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from snarfcli.bodies import Skeleton
 from snarfcli.bodies.skinning import skin_vertices
+from snarfcli.field_docs import documented
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.motions import Motion
 
@@ -21,6 +22,7 @@ HEIGHTS = ("auto", "ground", "file")
 _MOST_FRAMES = 200  # evenly spread over a clip; a foot stays on the ground for longer than the gap between two of them
 
 
+@documented
 @dataclass(frozen=True, eq=False)
 class Clip:
     """A motion to be exported."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from snarfcli.bodies import Skeleton
+from snarfcli.deformer import skin
 from snarfcli.fitting.corrections import Corrections, Corrector, bone_turns
 from snarfcli.models.fast_snarf import FastSnarf
 
@@ -231,9 +232,8 @@ class PoseFit:
 
 def _posed(avatar: CanonicalPoints, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
     """Return the avatar's points and normals in B poses, both [B, S, 3]."""
-    blended = torch.einsum("sj,bjrc->bsrc", avatar.weights, bone_transforms[:, :, :3])
-    points = (blended[..., :3] @ avatar.points[:, :, None])[..., 0] + blended[..., 3]
-    return points, F.normalize((blended[..., :3] @ avatar.normals[:, :, None])[..., 0], dim=-1)
+    points, normals = skin(avatar.points, avatar.weights, bone_transforms, directions=avatar.normals)
+    return points, F.normalize(normals, dim=-1)
 
 
 def _closest(points: Tensor, normals: Tensor, seen: Surfaces, back: int = 0) -> tuple[Tensor, Tensor]:

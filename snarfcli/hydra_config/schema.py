@@ -5,14 +5,12 @@ Imports of Hydra stand inside functions: it takes a third of a second, which --h
 
 from __future__ import annotations
 
-import ast
 import dataclasses
-import inspect
-import itertools
-import textwrap
 import typing
 from collections.abc import Iterator
 from pathlib import Path
+
+from snarfcli.field_docs import field_texts
 
 __all__ = [
     "config_folder",
@@ -70,25 +68,10 @@ def register_schemas(name: str, schema: type) -> None:
 
 def describe(schema: type) -> Iterator[tuple[str, str]]:
     """Yield name and docstring of each field of a dataclass; base classes first, fields that are dataclasses left out."""
-    texts: dict[str, str] = {}
-    for owner in reversed([kind for kind in schema.__mro__ if dataclasses.is_dataclass(kind)]):
-        texts |= _field_docstrings(owner)
-    nested = group_schemas(schema)
+    texts, nested = field_texts(schema), group_schemas(schema)
     for field in dataclasses.fields(schema):
         if field.name not in nested:
             yield field.name, texts.get(field.name, "")
-
-
-def _field_docstrings(owner: type) -> dict[str, str]:
-    """Return the string literals that stand below the fields of a class, which Python itself does not keep."""
-    definition = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
-    texts: dict[str, str] = {}
-    for field, below in itertools.pairwise(getattr(definition, "body", [])):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
-            literal = below.value
-            if isinstance(literal, ast.Constant) and isinstance(literal.value, str):
-                texts[field.target.id] = " ".join(literal.value.split())
-    return texts
 
 
 def setting_names(schema: type, prefix: str = "") -> list[str]:

@@ -15,6 +15,7 @@ from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.bodies.extent import bone_segments, weight_segments
 from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, ForwardDeformer, NodeWeights, SearchConfig, cells_near
 from snarfcli.deformer.cells import corners_of
+from snarfcli.deformer.skinning import skin
 from snarfcli.deformer.weights import VoxelWeights
 from snarfcli.models.pieces import floating_cells
 from snarfcli.models.settings import AvatarConfig, ModelConfig
@@ -328,8 +329,7 @@ class FastSnarf(System):
         canonical = self.deformer.random_canonical(count, generator)
         # without `weights`, the field itself at the points: to interpolate it, it would be evaluated at every node
         chosen = self.deformer.field(canonical) if weights is None else weights.at(canonical)
-        blended = torch.einsum("nj,bjrc->bnrc", chosen, bone_transforms[:, :, :3])
-        return (blended[..., :3] * canonical[:, None]).sum(-1) + blended[..., 3]
+        return skin(canonical, chosen, bone_transforms)
 
     def freeze(self) -> None:
         """Evaluate the skinning weights at the grid's nodes once and keep them.
@@ -385,21 +385,10 @@ def _parts_of_cells(grid: CanonicalGrid, shape: tuple[int, int, int]) -> list[in
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:
     """Blend logits [M] over the correspondences of each query to [B, N], so that each of them gets a gradient.
 
-    The weights are a softmax over the roots of a query, so that the result does not depend on how the roots were found.
-    A query without a root gets `NO_CORRESPONDENCE`.
-
-    Source: SNARF Sec. 3.2 (after Eq. 9); the form on logits is ours, and keeps its gradient where occupancies saturate.
+    A query without a root gets `NO_CORRESPONDENCE`. The papers blend probabilities; the form on logits is ours, and keeps its
+    gradient where occupancies saturate.
     """
-    values = logits if config.blend == "logit" else logits.sigmoid()
-    scores = config.blend_sharpness * values
-    total = found.batch * found.count
-    # One row more than queries, for the padding of a search with a capacity, which belongs to no query.
-    zeros = logits.new_zeros(total + 1)
-    highest = zeros.scatter_reduce(0, found.query, scores.detach(), "amax", include_self=False)
-    weights = (scores - highest[found.query]).exp()
-    norm = zeros.index_add(0, found.query, weights)
-    mean = (zeros.index_add(0, found.query, weights * values) / norm.clamp_min(1e-12))[:total]
-    mask = found.found.reshape(-1)
-    if config.blend == "probability":
-        mean = torch.logit(mean, eps=1e-6)
-    return torch.where(mask, mean, NO_CORRESPONDENCE).reshape(found.batch, found.count)
+    if config.blend == "logit":
+        return found.blend(logits, config.blend_sharpness, NO_CORRESPONDENCE)
+    mean = found.blend(logits.sigmoid(), config.blend_sharpness, 0.0)
+    return torch.where(found.found, torch.logit(mean, eps=1e-6), NO_CORRESPONDENCE)

@@ -155,7 +155,7 @@ class Nasa(PointwiseSystem):
             raise ValueError(f"template: wanted the subject's mesh to train {config.name}, got none")
         chosen = torch.randint(len(self._vertices), (config.part_points,), generator=generator).to(self._vertices.device)
         vertices, weights = self._vertices[chosen], self._vertex_weights[chosen]
-        posed = torch.stack([skin(vertices, weights, transforms) for transforms in bone_transforms])
+        posed = skin(vertices, weights, bone_transforms)
         wanted = _ON_SURFACE * F.one_hot(weights.argmax(1), self.num_bones).T.to(weights)
         occupancy = self.part_logits(posed, bone_transforms, precision).sigmoid()
         return {"parts": config.part_weight * F.mse_loss(occupancy, wanted.expand_as(occupancy))}

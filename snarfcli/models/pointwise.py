@@ -12,9 +12,10 @@ from torch.nn import functional as F
 
 from snarfcli.bodies import MeshTemplate, Skeleton
 from snarfcli.bodies.extent import bone_segments
-from snarfcli.deformer import CanonicalGrid, NodeWeights
+from snarfcli.deformer import CanonicalGrid, NodeWeights, inverse_skin
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.system import FieldSamples, Found, System
+from snarfcli.networks import WeightNormLinear
 from snarfcli.precision import matmul_precision
 from snarfcli.segments import distance_to_segments
 from snarfcli.shape import OccupancyNetwork
@@ -123,12 +124,10 @@ class PosedNetwork(nn.Module):
             nn.init.normal_(layers[-1].weight, 0, 1e-4)
             nn.init.zeros_(layers[-1].bias)
         if config.skinning.weight_norm:
-            for layer in layers:
-                nn.utils.parametrizations.weight_norm(layer)
+            layers = [WeightNormLinear(layer) for layer in layers]
             if starts_at_zero:  # small by its length alone: the first step would turn a short direction to anywhere
                 with torch.no_grad():
-                    direction = layers[-1].get_parameter("parametrizations.weight.original1")
-                    direction.mul_(1e4 / config.skinning.width**0.5)
+                    layers[-1].direction.mul_(1e4 / config.skinning.width**0.5)
         self.layers = nn.ModuleList(layers)
         self.register_buffer("scale", torch.tensor(float(scale)))
 
@@ -161,24 +160,8 @@ def move_with_bones(points: Tensor, owner: Tensor, bone_transforms: Tensor) -> T
 
 
 def invert_blended(points: Tensor, weights: Tensor, bone_transforms: Tensor) -> Tensor:
-    """Move posed points back by linear blend skinning with given weights: the inverse of SNARF Eq. 4 for fixed w.
+    """Move posed points [B, N, 3] back by linear blend skinning with given weights [B, N, J], see `inverse_skin`.
 
-    Blends of opposite rotations have no inverse. Near them the determinant is kept away from zero, so that points go far away
-    but stay finite.
-
-    Args:
-        points: [B, N, 3], posed, metres.
-        weights: [B, N, J], rows sum to 1.
-        bone_transforms: [B, J, 4, 4], canonical to posed.
-
-    Returns:
-        [B, N, 3], canonical, metres.
+    Blends of opposite rotations have no inverse. Near them points go far away but stay finite.
     """
-    blended = (weights @ bone_transforms[:, :, :3].flatten(2)).unflatten(2, (3, 4))
-    a, b, c = blended[..., :3].unbind(-2)
-    columns = [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)]
-    determinant = (a * columns[0]).sum(-1, keepdim=True)
-    least = torch.where(determinant < 0, -_LEAST_DETERMINANT, _LEAST_DETERMINANT)
-    determinant = torch.where(determinant.abs() < _LEAST_DETERMINANT, least, determinant)
-    offset = points - blended[..., 3]
-    return sum(column * offset[..., axis, None] for axis, column in enumerate(columns)) / determinant
+    return inverse_skin(points, weights, bone_transforms, _LEAST_DETERMINANT)

@@ -42,7 +42,7 @@ class SmplNN(PointwiseSystem):
         self.register_buffer("vertex_weights", torch.tensor(template.weights, dtype=torch.float32), persistent=False)
 
     def canonical_points(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        posed = [skin(self.vertices, self.vertex_weights, transforms) for transforms in bone_transforms]
+        posed = skin(self.vertices, self.vertex_weights, bone_transforms)
         nearest = torch.stack([nearest_vertex(part, mesh) for part, mesh in zip(points, posed, strict=True)])
         weights = self.vertex_weights[nearest]
         return invert_blended(points, weights, bone_transforms), weights

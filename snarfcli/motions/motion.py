@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from snarfcli.field_docs import documented
+
 __all__ = ["Motion"]
 
 
+@documented
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Poses of one skeleton over time, in a world with y up."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from snarfcli.networks import ACTIVATIONS, run_encoding, run_perceptron, run_pose_code, run_segment_distance
+from snarfcli.networks import ACTIVATIONS, WeightNormLinear, run_encoding, run_perceptron, run_pose_code, run_segment_distance
 from snarfcli.shape.features import FeatureGrids
 
 __all__ = ["LOGITS_PER_METRE", "SOFTPLUS_SHARPNESS", "OccupancyNetwork", "ShapeConfig"]
@@ -93,7 +93,7 @@ class OccupancyNetwork(nn.Module):
             joined = config.condition_size if self.conditioned and index == config.condition_layer else 0
             layer = nn.Linear(inputs + joined, config.width if index < config.depth else 1)
             self._initialise(layer, index, joined, point_size)
-            layers.append(nn.utils.parametrizations.weight_norm(layer) if config.weight_norm else layer)
+            layers.append(WeightNormLinear(layer) if config.weight_norm else layer)
         self.layers = nn.ModuleList(layers)
 
     @property

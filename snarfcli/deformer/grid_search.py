@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -14,6 +12,7 @@ from snarfcli.deformer.ops import broyden_search, complete_search
 from snarfcli.deformer.roots import invert_3x3
 from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
 from snarfcli.deformer.skinning import blend_transforms
+from snarfcli.deformer.starts import check_starts, start_transforms
 
 __all__ = ["check_transforms", "find_correspondences"]
 
@@ -25,6 +24,7 @@ def find_correspondences(
     grid: CanonicalGrid,
     *,
     search: SearchConfig | str | None = None,
+    starts: Tensor | None = None,
     active_cells: Tensor | None = None,
     capacity: int | None = None,
     check: bool = True,
@@ -38,6 +38,8 @@ def find_correspondences(
         grid: the box of the nodes.
         search: settings of the search, or its name: "complete" (cell by cell, without start bones) or "broyden" (the papers',
             from one start per bone). None for the defaults of `SearchConfig`.
+        starts: [B, N, I, 3], canonical points, metres, from which a broyden search starts instead of from bones. One that is
+            not finite is no start. They get no gradient.
         active_cells: [D-1, H-1, W-1], bool, the cells in which a complete search looks for roots; None for all.
         capacity: maximum number of roots to return. The results always have this length, and rows beyond the roots have the
             query B * N; so nothing waits for a GPU, and the call can be captured in a CUDA graph. torch.compile with
@@ -58,6 +60,7 @@ def find_correspondences(
     search = as_search_config(search)
     _check_shapes(points, bone_transforms, skinning_weights, active_cells)
     check_search_config(search, bone_transforms.shape[1])
+    check_starts(starts, points, search)
     if search.name == "broyden" and active_cells is not None:
         raise ValueError("active_cells needs search.name 'complete': a broyden search has no cells")
     if capacity is not None and capacity < 0:
@@ -72,20 +75,11 @@ def find_correspondences(
     if search.name == "complete":
         found = complete_search(points, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
     else:
-        starts = _start_transforms(bone_transforms.detach(), search.init_bones)
+        given = start_transforms(bone_transforms, search.init_bones) if starts is None else starts
         limits = (search.tolerance, search.divergence, search.max_steps)
-        found = broyden_search(points, transforms, starts, *box, *limits, search.jacobian == "exact", *common)
+        found = broyden_search(points, transforms, given.detach(), *box, *limits, search.jacobian == "exact", *common)
     canonical, query, jacobian_inverse, total = found
     return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
-
-
-def _start_transforms(bone_transforms: Tensor, init_bones: Sequence[int] | None) -> Tensor:
-    """Return the upper rows of the inverse transforms of the start bones, [B, I, 12], posed to canonical."""
-    # Stacked, since a list as an index would be copied to a GPU, which waits for it.
-    chosen = bone_transforms if init_bones is None else torch.stack([bone_transforms[:, bone] for bone in init_bones], 1)
-    turn, _ = invert_3x3(chosen[..., :3, :3].reshape(-1, 3, 3))
-    shift = -(turn * chosen[..., :3, 3].reshape(-1, 1, 3)).sum(-1)
-    return torch.cat([turn, shift[..., None]], -1).reshape(*chosen.shape[:2], 12)
 
 
 @torch.no_grad()

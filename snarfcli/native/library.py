@@ -20,7 +20,7 @@ __all__ = [
     "why_unavailable",
 ]
 
-ABI_VERSION = 4
+ABI_VERSION = 5
 """Version of the C interface (csrc/include/snarf/api.h) that this code uses."""
 
 _ENDINGS = {"darwin": "dylib", "win32": "dll"}

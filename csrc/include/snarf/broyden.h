@@ -18,6 +18,13 @@ struct Broyden {
   bool exact_jacobian;
 };
 
+// The start x[3] that the upper rows [12] of an inverse bone transform give for a query, canonical.
+template <class S>
+SNARF_HD void start_from(const S* back, const S* target, S* x) {
+  for (int i = 0; i < 3; ++i)
+    x[i] = back[4 * i] * target[0] + back[4 * i + 1] * target[1] + back[4 * i + 2] * target[2] + back[4 * i + 3];
+}
+
 // Blended transform [12] at the canonical point x, and on request its three derivatives by the cell coordinates, [3][12].
 template <class S>
 SNARF_HD void blend_at(const S* transforms, const Grid<S>& grid, const S* x, S* blended, S* derivatives) {

@@ -41,7 +41,7 @@ def broyden_roots(
         shape: nodes (D, H, W).
         exact_jacobian: the inverse Jacobian at the root, or the approximation left by the iteration (Fast-SNARF Eq. 15).
         tolerance: largest residual of a root, metres.
-        divergence: residual at which a start is given up, metres.
+        divergence: residual after a step at which a start is given up, metres.
         max_steps: maximum number of steps from one start.
 
     Source: SNARF Eq. 6-8; Fast-SNARF Eq. 7-9 and Sec. 4.1.
@@ -110,7 +110,8 @@ def _iterate(
         converged = distance < tolerance
         done = converged.nonzero()[:, 0]
         found.append((x[done], query[done], inverse[done]))
-        going = (~converged & (distance < divergence)).nonzero()[:, 0]
+        limit = divergence if step_number else torch.inf  # as SNARF does, the start itself is not judged
+        going = (~converged & (distance < limit)).nonzero()[:, 0]
         if step_number == max_steps or not len(going):
             break
         query, x, residual, inverse = query[going], x[going], residual[going], inverse[going]

@@ -181,7 +181,8 @@ def _iterate(
         converged = distance < settings.tolerance
         done = converged.nonzero()[:, 0]
         found.append((x[done], query[done], inverse[done], start[done]))
-        going = (~converged & (distance < settings.divergence)).nonzero()[:, 0]
+        limit = settings.divergence if step_number else torch.inf  # as SNARF does, the start itself is not judged
+        going = (~converged & (distance < limit)).nonzero()[:, 0]
         if step_number == settings.max_steps or not len(going):
             break
         query, x, residual, inverse, start = query[going], x[going], residual[going], inverse[going], start[going]

@@ -92,6 +92,31 @@ def test_starts_outside_are_moved_to_the_border(backend):
     assert torch.equal(found.canonical, wanted.canonical)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_residual_of_a_start_is_not_judged(backend):
+    """One bone: a single step leads from anywhere to the root, however small the divergence is."""
+    weights, transforms = torch.ones(3, 3, 3, 1, dtype=torch.float64), random_transforms(1, 1, 1.0)
+    points, canonical = posed_queries(weights, transforms[0], 20)
+    starts = canonical.flip(0)[None, :, None]
+    settings = search(backend, divergence=1e-6)
+    found = find_correspondences(points[None], transforms, weights, unit_grid(), search=settings, starts=starts)
+    assert torch.equal(found.query, torch.arange(20))
+    torch.testing.assert_close(found.canonical, canonical, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_residual_after_a_step_is_judged(backend):
+    """With a divergence below the tolerance only those starts are left that one step brings to a root."""
+    points, transforms, weights = scene(torch.float64, count=60)
+    given = (points, transforms, weights, unit_grid())
+    at_first = find_correspondences(*given, search=search(backend, tolerance=1e-3, divergence=1e-6))
+    one_step = find_correspondences(*given, search=search(backend, tolerance=1e-3, divergence=1e6, max_steps=1))
+    everything = find_correspondences(*given, search=search(backend, tolerance=1e-3))
+    assert 0 < len(at_first.query) < len(everything.query)
+    assert torch.equal(at_first.query, one_step.query)
+    assert torch.equal(at_first.canonical, one_step.canonical)
+
+
 @pytest.mark.skipif(host_compiler() is None, reason="needs a C++ compiler")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 def test_kernels_agree(dtype):
@@ -99,6 +124,7 @@ def test_kernels_agree(dtype):
     points, transforms, weights = scene(dtype, batch=3, count=70, angle=0.3)
     starts = images_under_bones(points, transforms)
     starts[:, ::3, 1] = torch.nan
+    starts[:, 1::5, 2] = 0.9  # far from the root, with a residual beyond the divergence
     grid, tolerance = unit_grid(dtype), 5e-6 if dtype == torch.float32 else 1e-9
     nodes = blend_transforms(weights, transforms)
     given = (points, nodes, starts, grid.lower, grid.upper, list(SHAPE), tolerance, 0.25, 40, True, False, None)

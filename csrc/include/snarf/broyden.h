@@ -13,7 +13,7 @@ namespace SNARF_ISA {
 template <class S>
 struct Broyden {
   S tolerance;   // largest residual of a root, metres
-  S divergence;  // residual at which a start is given up, metres
+  S divergence;  // residual after a step at which a start is given up, metres
   int max_steps;
   bool exact_jacobian;
 };
@@ -96,7 +96,9 @@ SNARF_HD bool broyden(const S* transforms, const Grid<S>& grid, const Broyden<S>
   for (int k = 0;; ++k) {
     S distance2 = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2];
     if (distance2 < tolerance2) break;
-    if (k == settings.max_steps || !(distance2 < divergence2)) return false;
+    // As SNARF does, the residual of the start itself is not judged: the first step may lead far closer. It must be finite.
+    const bool hopeful = k ? distance2 < divergence2 : distance2 - distance2 == 0;
+    if (k == settings.max_steps || !hopeful) return false;
     S step[3], change[3], towards[3], row[3];
     for (int i = 0; i < 3; ++i) {
       S moved = x[i] - (inverse[3 * i] * residual[0] + inverse[3 * i + 1] * residual[1] + inverse[3 * i + 2] * residual[2]);

@@ -34,7 +34,7 @@ def find_correspondences(
     Args:
         points: [B, N, 3], queries, posed space, metres. A non-finite point has no correspondence.
         bone_transforms: [B, J, 4, 4], canonical to posed, metres; invertible.
-        skinning_weights: [D, H, W, J], at the grid nodes (z, y, x), rows sum to 1.
+        skinning_weights: [D, H, W, J], at the grid nodes (z, y, x), rows sum to 1; or [B, D, H, W, J], those of each pose.
         grid: the box of the nodes.
         search: settings of the search, or its name: "complete" (cell by cell, without start bones) or "broyden" (the papers',
             from one start per bone). None for the defaults of `SearchConfig`.
@@ -68,9 +68,8 @@ def find_correspondences(
     grid = grid.to(points)
     if check:
         _check_values(grid, bone_transforms, skinning_weights, active_cells)
-    depth, height, width = skinning_weights.shape[:3]
     transforms = blend_transforms(skinning_weights, bone_transforms, active_cells, search.backend)
-    box = (grid.lower, grid.upper, [depth, height, width])
+    box = (grid.lower, grid.upper, list(skinning_weights.shape[-4:-1]))
     common = (search.orientation_preserving, capacity, search.backend)
     if search.name == "complete":
         found = complete_search(points, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
@@ -126,11 +125,12 @@ def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Ten
     """Raise ValueError or TypeError if the tensors do not fit together."""
     if points.ndim != 3 or points.shape[2] != 3:
         raise ValueError(f"points: wanted shape [B, N, 3], got {list(points.shape)}")
-    if skinning_weights.ndim != 4 or min(skinning_weights.shape[:3]) < 2 or skinning_weights.shape[3] < 1:
-        raise ValueError(
-            f"skinning_weights: wanted shape [D, H, W, J], at least 2 nodes per side, got {list(skinning_weights.shape)}"
-        )
-    wanted = [points.shape[0], skinning_weights.shape[3], 4, 4]
+    batch, shape = points.shape[0], list(skinning_weights.shape)
+    if len(shape) not in (4, 5) or min(shape[-4:-1]) < 2 or shape[-1] < 1:
+        raise ValueError(f"skinning_weights: wanted shape [D, H, W, J], at least 2 nodes per side, got {shape}")
+    if len(shape) == 5 and shape[0] != batch:
+        raise ValueError(f"skinning_weights: wanted shape [{batch}, D, H, W, J] to fit points, got {shape}")
+    wanted = [batch, shape[-1], 4, 4]
     if list(bone_transforms.shape) != wanted:
         raise ValueError(f"bone_transforms: wanted shape {wanted} to fit the others, got {list(bone_transforms.shape)}")
     for name, tensor in (("points", points), ("bone_transforms", bone_transforms), ("skinning_weights", skinning_weights)):
@@ -142,7 +142,7 @@ def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Ten
             raise ValueError(f"{name}: wanted the device of points, {points.device}, got {tensor.device}")
     if active_cells is None:
         return
-    cells = [n - 1 for n in skinning_weights.shape[:3]]
+    cells = [n - 1 for n in shape[-4:-1]]
     if list(active_cells.shape) != cells or active_cells.dtype != torch.bool:
         raise ValueError(f"active_cells: wanted bool {cells}, got {active_cells.dtype} {list(active_cells.shape)}")
     if active_cells.device != points.device:

@@ -189,7 +189,7 @@ def test_works_wherever_autograd_is_off_and_under_autocast(scene):
 
 
 def test_rigid_fields_have_one_root_each():
-    """One bone everywhere: the root is B^-1 x', one step from every start, whose residual is not judged. Weights are constants."""
+    """One bone everywhere, weights are constants: the root B^-1 x' is one step away from starts whose residual is not judged."""
     transforms = random_transforms(1, BONES, 1.0)
     points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     only = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)

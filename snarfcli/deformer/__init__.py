@@ -10,6 +10,7 @@ from snarfcli.deformer.diffusion import PresetWeights
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.grid_search import find_correspondences
+from snarfcli.deformer.map_search import find_correspondences_on_map
 from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, skin
 from snarfcli.deformer.skinning_config import SkinningConfig
@@ -29,5 +30,6 @@ __all__ = [
     "cells_near",
     "find_correspondences",
     "find_correspondences_on_field",
+    "find_correspondences_on_map",
     "skin",
 ]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from snarfcli.deformer.callables import with_pose
+from snarfcli.deformer.centring import Centred, centre
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.map_roots import MapSettings, PosedMap, search_map
@@ -65,17 +67,20 @@ def find_correspondences_on_field(
     search = as_search_config(search)
     _check(points, bone_transforms, starts, search, start_jacobian)
     grid = grid.to(points)
-    settings = MapSettings.of(search, grid if bounded else None, grid.longest_side, points_at_once)
-    inverses = _inverses(bone_transforms)
+    centred = centre(bone_transforms, grid)
+    near, inverses = centred.points(points), _inverses(centred.transforms)
+    settings = MapSettings.of(search, centred.grid if bounded else None, grid.longest_side, points_at_once)
     field = with_pose(field)
 
     def at_pose(b: int) -> PosedMap:
-        return _Skinning(field, bone_transforms[b], b, start_jacobian == "exact")
+        return _Skinning(field, centred, b, start_jacobian == "exact")
 
-    if starts is not None:
-        return search_map(points, at_pose, lambda b, some: starts[b, some], starts.shape[2], settings)
+    def starts_of(b: int, some: slice) -> Tensor:
+        return _images(inverses[b, bones], near[b, some]) if starts is None else centred.starts(starts[b, some])
+
     bones = list(range(inverses.shape[1])) if search.init_bones is None else list(search.init_bones)
-    return search_map(points, at_pose, lambda b, some: _images(inverses[b, bones], points[b, some]), len(bones), settings)
+    found = search_map(near, at_pose, starts_of, len(bones) if starts is None else starts.shape[2], settings)
+    return replace(found, canonical=centred.restored(found.canonical))
 
 
 @torch.no_grad()
@@ -93,15 +98,15 @@ def _images(transforms: Tensor, points: Tensor) -> Tensor:
 
 
 class _Skinning(PosedMap):
-    """Forward skinning d(x) = sum_j w_j(x) B_j x of one pose [J, 4, 4] with a callable field (SNARF Eq. 4)."""
+    """Forward skinning d(x) = sum_j w_j(x) B_j x in one pose with a callable field (SNARF Eq. 4), in centred frames."""
 
-    def __init__(self, field: Callable[[Tensor, Tensor], Tensor], transforms: Tensor, pose: int, exact_start: bool) -> None:
-        self.field, self.pose, self.exact_start = field, pose, exact_start
-        self.rows = transforms[:, :3].reshape(len(transforms), 12)
+    def __init__(self, field: Callable[[Tensor, Tensor], Tensor], centred: Centred, pose: int, exact_start: bool) -> None:
+        self.field, self.centred, self.pose, self.exact_start = field, centred, pose, exact_start
+        self.rows = centred.transforms[pose, :, :3].flatten(1)
 
     def blended(self, x: Tensor) -> Tensor:
         """Return the blended transforms [K, 3, 4] at canonical points [K, 3]."""
-        weights = self.field(x, torch.full((len(x),), self.pose, device=x.device))
+        weights = self.field(self.centred.restored(x), torch.full((len(x),), self.pose, device=x.device))
         if tuple(weights.shape) != (len(x), len(self.rows)):
             raise ValueError(f"field: wanted weights of shape [{len(x)}, {len(self.rows)}], got {list(weights.shape)}")
         return (weights.to(self.rows.dtype) @ self.rows).reshape(-1, 3, 4)

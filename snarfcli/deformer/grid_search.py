@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from snarfcli.deformer.cells import corners_of
+from snarfcli.deformer.centring import centre
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.ops import broyden_search, complete_search
-from snarfcli.deformer.roots import invert_3x3
+from snarfcli.deformer.roots import invert_3x3, is_costly_to_read
 from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.deformer.starts import check_starts, start_transforms
@@ -68,16 +69,19 @@ def find_correspondences(
     grid = grid.to(points)
     if check:
         _check_values(grid, bone_transforms, skinning_weights, active_cells)
-    transforms = blend_transforms(skinning_weights, bone_transforms, active_cells, search.backend)
-    box = (grid.lower, grid.upper, list(skinning_weights.shape[-4:-1]))
+    centred = centre(bone_transforms, grid)
+    near = centred.points(points)
+    transforms = blend_transforms(skinning_weights, centred.transforms, active_cells, search.backend)
+    box = (centred.grid.lower, centred.grid.upper, list(skinning_weights.shape[-4:-1]))
     common = (search.orientation_preserving, capacity, search.backend)
     if search.name == "complete":
-        found = complete_search(points, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
+        found = complete_search(near, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
     else:
-        given = start_transforms(bone_transforms, search.init_bones) if starts is None else starts
+        given = start_transforms(centred.transforms, search.init_bones) if starts is None else centred.starts(starts)
         limits = (search.tolerance, search.divergence, search.max_steps)
-        found = broyden_search(points, transforms, given.detach(), *box, *limits, search.jacobian == "exact", *common)
+        found = broyden_search(near, transforms, given.detach(), *box, *limits, search.jacobian == "exact", *common)
     canonical, query, jacobian_inverse, total = found
+    canonical = centred.restored(canonical, query < points.shape[0] * points.shape[1])
     return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
 
 
@@ -87,7 +91,7 @@ def check_transforms(bone_transforms: Tensor) -> None:
 
     Skipped on a GPU, where the check would force a synchronisation.
     """
-    if _skips_checks(bone_transforms):
+    if is_costly_to_read(bone_transforms):
         return
     if not bool(bone_transforms.isfinite().all()):
         raise ValueError("bone_transforms: wanted finite numbers, got NaN or infinite ones")
@@ -99,14 +103,9 @@ def check_transforms(bone_transforms: Tensor) -> None:
         raise ValueError(f"bone_transforms: wanted invertible ones, got a singular one for bone {bone} of pose {pose}")
 
 
-def _skips_checks(tensor: Tensor) -> bool:
-    """Return whether reading the values of a tensor would wait for a GPU, or break a graph that is compiled."""
-    return tensor.is_cuda or torch.compiler.is_compiling()
-
-
 def _check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
     """Raise ValueError if grid, transforms or weights are invalid. Skipped on a GPU, as in `check_transforms`."""
-    if _skips_checks(bone_transforms):
+    if is_costly_to_read(bone_transforms):
         return
     if not bool((grid.upper > grid.lower).all()):
         box = f"{grid.lower.tolist()} and {grid.upper.tolist()}"

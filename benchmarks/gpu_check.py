@@ -30,8 +30,8 @@ from released_search import released_search
 from torch import Tensor
 
 from snarfcli.deformer import CanonicalGrid, SearchConfig, find_correspondences
-from snarfcli.deformer.grid_search import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
+from snarfcli.deformer.starts import start_transforms
 from snarfcli.native import cuda, cuda_compile, cuda_driver, cuda_launches
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -64,7 +64,7 @@ class Case:
         self.shape = tuple(self.weights.shape[:3])
         self.transforms = blend_transforms(self.weights, self.bones)
         self.box = (self.grid.lower, self.grid.upper, self.shape)
-        self.starts = {"9": _start_transforms(self.bones, self.nine), "all": _start_transforms(self.bones, None)}
+        self.starts = {"9": start_transforms(self.bones, self.nine), "all": start_transforms(self.bones, None)}
 
     @property
     def cells(self) -> int:

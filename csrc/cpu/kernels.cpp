@@ -344,10 +344,11 @@ void broyden_queries(const BroydenTask<S>& task, int64_t first, int64_t last, Ro
     S known[3 * 64];  // roots of this query so far; more than 64 distinct ones would only be reported twice
     int roots = 0;
     for (int64_t start = 0; start < task.count; ++start) {
-      const S* back = task.starts + 12 * start;
       S x[3], inverse[9], minors[9];
-      for (int i = 0; i < 3; ++i)
-        x[i] = back[4 * i] * target[0] + back[4 * i + 1] * target[1] + back[4 * i + 2] * target[2] + back[4 * i + 3];
+      if (task.starts_are_points)
+        memcpy(x, task.starts + 3 * (n * task.count + start), sizeof(x));
+      else
+        start_from(task.starts + 12 * start, target, x);
       if (!(x[0] - x[0] == 0 && x[1] - x[1] == 0 && x[2] - x[2] == 0)) continue;
       if (!broyden(task.transforms, grid, settings, target, x, inverse)) continue;
       bool is_new = true;

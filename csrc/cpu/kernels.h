@@ -127,11 +127,11 @@ struct BroydenTask {
   const S* transforms;  // of the pose, [V, 12]
   Geometry<S> geometry;
   const S* points;  // of the pose, [N, 3]
-  const S* starts;  // of the pose, [count, 12]
+  const S* starts;  // of the pose, [count, 12], or of its queries, [N, count, 3]
   int64_t count;
   S tolerance, divergence, same_root;
   int32_t max_steps;
-  bool exact_jacobian, orientation_preserving;
+  bool starts_are_points, exact_jacobian, orientation_preserving;
 };
 
 template <class S>

@@ -27,6 +27,7 @@ void broyden_search(const snarf_field& field, const snarf_queries& queries, cons
   common.divergence = S(settings.divergence);
   common.same_root = S(kSameBroydenRoot) * smallest_side(common.geometry);
   common.max_steps = settings.max_steps;
+  common.starts_are_points = settings.starts_are_points != 0;
   common.exact_jacobian = settings.exact_jacobian != 0;
   common.orientation_preserving = settings.orientation_preserving != 0;
   const int64_t at_once = std::min(queries.count, kGroupQueries);
@@ -40,7 +41,8 @@ void broyden_search(const snarf_field& field, const snarf_queries& queries, cons
       BroydenTask<S> task = common;
       task.transforms = static_cast<const S*>(field.transforms) + 12 * node_count(field) * pose;
       task.points = static_cast<const S*>(queries.points) + 3 * (pose * queries.count + query);
-      task.starts = static_cast<const S*>(settings.starts) + 12 * settings.count * pose;
+      const int64_t before = common.starts_are_points ? 3 * (pose * queries.count + query) : 12 * pose;
+      task.starts = static_cast<const S*>(settings.starts) + settings.count * before;
       Queue queue(count, 256);
       Collect<S> collect(*group, count, threads, common.same_root);
       std::vector<std::function<void(int)>> phases;

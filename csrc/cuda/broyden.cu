@@ -1,4 +1,4 @@
-// The papers' search: Broyden's method from one start per bone (broyden.h).
+// The papers' search: Broyden's method from one start per bone, or from given starts (broyden.h).
 //
 // DESIGN. One thread takes one query through all its starts, one after the other, and drops what it has found already. A thread
 // for each pair of query and start would need memory for queries times starts, since which of several equal roots is kept must
@@ -25,10 +25,11 @@ extern "C" __global__ void __launch_bounds__(128) search_from_starts(const Searc
   for (int i = 0; i < 3; ++i) target[i] = a.points[3 * query + i];
   if (!is_finite(target)) return;
   for (int start = 0; start < a.start_count; ++start) {
-    const S* back = a.starts + 12 * ((long long)a.start_count * pose + start);
     S x[3], inverse[9];
-    for (int i = 0; i < 3; ++i)
-      x[i] = back[4 * i] * target[0] + back[4 * i + 1] * target[1] + back[4 * i + 2] * target[2] + back[4 * i + 3];
+    if (a.starts_are_points)
+      for (int i = 0; i < 3; ++i) x[i] = a.starts[3 * (a.start_count * query + start) + i];
+    else
+      start_from(a.starts + 12 * ((long long)a.start_count * pose + start), target, x);
     if (!is_finite(x) || !broyden(transforms, grid, settings, target, x, inverse)) continue;
     bool is_new = !a.orientation_preserving || preserves_orientation(inverse);
     for (int slot = a.head[query]; slot && is_new; slot = a.root_next[slot - 1])

@@ -28,7 +28,7 @@ struct Search {
   const S* lower;               // [3], canonical position of the first node, metres
   const S* upper;               // [3], and of the last
   const unsigned char* active;  // [all cells], or null
-  const S* starts;              // [B, I, 12], posed to canonical (broyden)
+  const S* starts;              // [B, I, 12], posed to canonical, or canonical points [B, N, I, 3], metres (broyden)
   // Cells of the group.
   S* records;        // [P, C], Record
   int* list;         // [P, C]: numbers of the tame cells from the front, of the others from the back
@@ -62,6 +62,7 @@ struct Search {
   int bins;                      // most bins of a pose
   int slots, capacity;
   int start_count;  // I
+  int starts_are_points;
   int max_steps;
   int exact_jacobian;
   int orientation_preserving;

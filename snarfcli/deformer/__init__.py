@@ -11,6 +11,7 @@ from snarfcli.deformer.diffusion import PresetWeights
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.grid_search import find_correspondences
+from snarfcli.deformer.map_search import find_correspondences_on_map
 from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, blended_matrices, inverse_skin, skin
 from snarfcli.deformer.skinning_config import SkinningConfig
@@ -32,6 +33,7 @@ __all__ = [
     "cells_near",
     "find_correspondences",
     "find_correspondences_on_field",
+    "find_correspondences_on_map",
     "inverse_skin",
     "skin",
 ]

@@ -1,4 +1,4 @@
-"""The papers' correspondence search: Broyden's method from one start per bone (SNARF Sec. 3.2, Fast-SNARF Alg. 1)."""
+"""The papers' correspondence search: Broyden's method from several starts (SNARF Sec. 3.2, Fast-SNARF Alg. 1)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def broyden_roots(
     divergence: float,
     max_steps: int,
 ) -> Roots:
-    """Find canonical correspondences from the start points B_i^-1 x'.
+    """Find canonical correspondences from the start points B_i^-1 x', or from given ones.
 
     Differs from the released code in three places: the start Jacobian is exact, a step outside the grid is clamped to its
     border (in that code the transforms outside are zero), and J^-1 at the root is exact if `exact_jacobian`.
@@ -35,12 +35,13 @@ def broyden_roots(
     Args:
         points: [B, N, 3], queries, posed space, metres. Non-finite ones have no root.
         transforms: [B, D * H * W, 12], blended transforms at the nodes.
-        starts: [B, I, 12], upper three rows of the inverse transforms of the start bones.
+        starts: [B, I, 12], upper three rows of the inverse transforms of the start bones, or [B, N, I, 3], canonical points,
+            metres, of which one that is not finite is no start.
         grid: the box of the nodes.
         shape: nodes (D, H, W).
         exact_jacobian: the inverse Jacobian at the root, or the approximation left by the iteration (Fast-SNARF Eq. 15).
         tolerance: largest residual of a root, metres.
-        divergence: residual at which a start is given up, metres.
+        divergence: residual after a step at which a start is given up, metres.
         max_steps: maximum number of steps from one start.
 
     Source: SNARF Eq. 6-8; Fast-SNARF Eq. 7-9 and Sec. 4.1.
@@ -49,14 +50,11 @@ def broyden_roots(
     same = _SAME_ROOT * float(grid.cell_size(shape).min())
     parts = []
     for b in range(batch):
-        rows = starts[b].reshape(-1, 3, 4)
         for first in range(0, max(count, 1), _QUERIES_AT_ONCE):
             queries = points[b, first : first + _QUERIES_AT_ONCE]
-            known = queries.isfinite().all(1).nonzero()[:, 0]
-            begin = (torch.einsum("irc,nc->nir", rows[..., :3], queries[known]) + rows[..., 3]).reshape(-1, 3)
-            query = known[:, None].expand(-1, len(rows)).reshape(-1)
+            given = starts[b] if starts.ndim == 3 else starts[b, first : first + _QUERIES_AT_ONCE]
             roots = _iterate(
-                queries, query, begin, transforms[b], grid, shape, exact_jacobian, tolerance, divergence, max_steps
+                queries, *_starts(queries, given), transforms[b], grid, shape, exact_jacobian, tolerance, divergence, max_steps
             )
             roots.query += b * count + first
             parts.append(drop_duplicates(roots, same))
@@ -65,6 +63,20 @@ def broyden_roots(
         empty = transforms.new_empty(1, 12)
         return _iterate(points.reshape(-1, 3), none, points.new_empty(0, 3), empty, grid, shape, True, 0.0, 0.0, 0)
     return Roots.concatenate(parts)
+
+
+def _starts(queries: Tensor, starts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the queries [S], as indices, and the canonical points [S, 3] of all starts.
+
+    Args:
+        queries: [N, 3].
+        starts: [I, 12] or [N, I, 3], see `broyden_roots`.
+    """
+    if starts.ndim == 2:
+        rows = starts.reshape(-1, 3, 4)
+        starts = torch.einsum("irc,nc->nir", rows[..., :3], queries) + rows[..., 3]
+    query, number = (queries.isfinite().all(1)[:, None] & starts.isfinite().all(2)).nonzero(as_tuple=True)
+    return query, starts[query, number]
 
 
 def _iterate(
@@ -98,7 +110,8 @@ def _iterate(
         converged = distance < tolerance
         done = converged.nonzero()[:, 0]
         found.append((x[done], query[done], inverse[done]))
-        going = (~converged & (distance < divergence)).nonzero()[:, 0]
+        limit = divergence if step_number else torch.inf  # as SNARF does, the start itself is not judged
+        going = (~converged & (distance < limit)).nonzero()[:, 0]
         if step_number == max_steps or not len(going):
             break
         query, x, residual, inverse = query[going], x[going], residual[going], inverse[going]

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
 from snarfcli.deformer.cells import corners_of
+from snarfcli.deformer.centring import centre
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.ops import broyden_search, complete_search
-from snarfcli.deformer.roots import invert_3x3
+from snarfcli.deformer.roots import invert_3x3, is_costly_to_read
 from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
 from snarfcli.deformer.skinning import blend_transforms
+from snarfcli.deformer.starts import check_starts, start_transforms
 
 __all__ = ["check_transforms", "find_correspondences"]
 
@@ -25,6 +25,7 @@ def find_correspondences(
     grid: CanonicalGrid,
     *,
     search: SearchConfig | str | None = None,
+    starts: Tensor | None = None,
     active_cells: Tensor | None = None,
     capacity: int | None = None,
     check: bool = True,
@@ -34,10 +35,12 @@ def find_correspondences(
     Args:
         points: [B, N, 3], queries, posed space, metres. A non-finite point has no correspondence.
         bone_transforms: [B, J, 4, 4], canonical to posed, metres; invertible.
-        skinning_weights: [D, H, W, J], at the grid nodes (z, y, x), rows sum to 1.
+        skinning_weights: [D, H, W, J], at the grid nodes (z, y, x), rows sum to 1; or [B, D, H, W, J], those of each pose.
         grid: the box of the nodes.
         search: settings of the search, or its name: "complete" (cell by cell, without start bones) or "broyden" (the papers',
             from one start per bone). None for the defaults of `SearchConfig`.
+        starts: [B, N, I, 3], canonical points, metres, from which a broyden search starts instead of from bones. One that is
+            not finite is no start. They get no gradient.
         active_cells: [D-1, H-1, W-1], bool, the cells in which a complete search looks for roots; None for all.
         capacity: maximum number of roots to return. The results always have this length, and rows beyond the roots have the
             query B * N; so nothing waits for a GPU, and the call can be captured in a CUDA graph. torch.compile with
@@ -58,6 +61,7 @@ def find_correspondences(
     search = as_search_config(search)
     _check_shapes(points, bone_transforms, skinning_weights, active_cells)
     check_search_config(search, bone_transforms.shape[1])
+    check_starts(starts, points, search)
     if search.name == "broyden" and active_cells is not None:
         raise ValueError("active_cells needs search.name 'complete': a broyden search has no cells")
     if capacity is not None and capacity < 0:
@@ -65,27 +69,20 @@ def find_correspondences(
     grid = grid.to(points)
     if check:
         _check_values(grid, bone_transforms, skinning_weights, active_cells)
-    depth, height, width = skinning_weights.shape[:3]
-    transforms = blend_transforms(skinning_weights, bone_transforms, active_cells, search.backend)
-    box = (grid.lower, grid.upper, [depth, height, width])
+    centred = centre(bone_transforms, grid)
+    near = centred.points(points)
+    transforms = blend_transforms(skinning_weights, centred.transforms, active_cells, search.backend)
+    box = (centred.grid.lower, centred.grid.upper, list(skinning_weights.shape[-4:-1]))
     common = (search.orientation_preserving, capacity, search.backend)
     if search.name == "complete":
-        found = complete_search(points, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
+        found = complete_search(near, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
     else:
-        starts = _start_transforms(bone_transforms.detach(), search.init_bones)
+        given = start_transforms(centred.transforms, search.init_bones) if starts is None else centred.starts(starts)
         limits = (search.tolerance, search.divergence, search.max_steps)
-        found = broyden_search(points, transforms, starts, *box, *limits, search.jacobian == "exact", *common)
+        found = broyden_search(near, transforms, given.detach(), *box, *limits, search.jacobian == "exact", *common)
     canonical, query, jacobian_inverse, total = found
+    canonical = centred.restored(canonical, query < points.shape[0] * points.shape[1])
     return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
-
-
-def _start_transforms(bone_transforms: Tensor, init_bones: Sequence[int] | None) -> Tensor:
-    """Return the upper rows of the inverse transforms of the start bones, [B, I, 12], posed to canonical."""
-    # Stacked, since a list as an index would be copied to a GPU, which waits for it.
-    chosen = bone_transforms if init_bones is None else torch.stack([bone_transforms[:, bone] for bone in init_bones], 1)
-    turn, _ = invert_3x3(chosen[..., :3, :3].reshape(-1, 3, 3))
-    shift = -(turn * chosen[..., :3, 3].reshape(-1, 1, 3)).sum(-1)
-    return torch.cat([turn, shift[..., None]], -1).reshape(*chosen.shape[:2], 12)
 
 
 @torch.no_grad()
@@ -94,7 +91,7 @@ def check_transforms(bone_transforms: Tensor) -> None:
 
     Skipped on a GPU, where the check would force a synchronisation.
     """
-    if _skips_checks(bone_transforms):
+    if is_costly_to_read(bone_transforms):
         return
     if not bool(bone_transforms.isfinite().all()):
         raise ValueError("bone_transforms: wanted finite numbers, got NaN or infinite ones")
@@ -106,14 +103,9 @@ def check_transforms(bone_transforms: Tensor) -> None:
         raise ValueError(f"bone_transforms: wanted invertible ones, got a singular one for bone {bone} of pose {pose}")
 
 
-def _skips_checks(tensor: Tensor) -> bool:
-    """Return whether reading the values of a tensor would wait for a GPU, or break a graph that is compiled."""
-    return tensor.is_cuda or torch.compiler.is_compiling()
-
-
 def _check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
     """Raise ValueError if grid, transforms or weights are invalid. Skipped on a GPU, as in `check_transforms`."""
-    if _skips_checks(bone_transforms):
+    if is_costly_to_read(bone_transforms):
         return
     if not bool((grid.upper > grid.lower).all()):
         box = f"{grid.lower.tolist()} and {grid.upper.tolist()}"
@@ -132,11 +124,12 @@ def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Ten
     """Raise ValueError or TypeError if the tensors do not fit together."""
     if points.ndim != 3 or points.shape[2] != 3:
         raise ValueError(f"points: wanted shape [B, N, 3], got {list(points.shape)}")
-    if skinning_weights.ndim != 4 or min(skinning_weights.shape[:3]) < 2 or skinning_weights.shape[3] < 1:
-        raise ValueError(
-            f"skinning_weights: wanted shape [D, H, W, J], at least 2 nodes per side, got {list(skinning_weights.shape)}"
-        )
-    wanted = [points.shape[0], skinning_weights.shape[3], 4, 4]
+    batch, shape = points.shape[0], list(skinning_weights.shape)
+    if len(shape) not in (4, 5) or min(shape[-4:-1]) < 2 or shape[-1] < 1:
+        raise ValueError(f"skinning_weights: wanted shape [D, H, W, J], at least 2 nodes per side, got {shape}")
+    if len(shape) == 5 and shape[0] != batch:
+        raise ValueError(f"skinning_weights: wanted shape [{batch}, D, H, W, J] to fit points, got {shape}")
+    wanted = [batch, shape[-1], 4, 4]
     if list(bone_transforms.shape) != wanted:
         raise ValueError(f"bone_transforms: wanted shape {wanted} to fit the others, got {list(bone_transforms.shape)}")
     for name, tensor in (("points", points), ("bone_transforms", bone_transforms), ("skinning_weights", skinning_weights)):
@@ -148,7 +141,7 @@ def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Ten
             raise ValueError(f"{name}: wanted the device of points, {points.device}, got {tensor.device}")
     if active_cells is None:
         return
-    cells = [n - 1 for n in skinning_weights.shape[:3]]
+    cells = [n - 1 for n in shape[-4:-1]]
     if list(active_cells.shape) != cells or active_cells.dtype != torch.bool:
         raise ValueError(f"active_cells: wanted bool {cells}, got {active_cells.dtype} {list(active_cells.shape)}")
     if active_cells.device != points.device:

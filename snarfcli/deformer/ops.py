@@ -112,11 +112,12 @@ def broyden_search(
     capacity: int | None,
     backend: str,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Run Broyden's method from the images of each query under `starts`; otherwise as `complete_search`.
+    """Run Broyden's method from every start of each query; otherwise as `complete_search`.
 
     Args:
-        starts: [B, I, 12], upper three rows of the inverse transforms of the start bones, posed to canonical.
-        divergence: residual at which a start is given up, as a share of the box's longest side.
+        starts: [B, I, 12], upper three rows of the inverse transforms of the start bones, posed to canonical: a query starts
+            from its images under them. Or [B, N, I, 3], canonical points, metres; one that is not finite is no start.
+        divergence: residual after a step at which a start is given up, as a share of the box's longest side.
         exact_jacobian: whether the inverse Jacobian is the exact one at the root or the iteration's approximation.
     """
     choose_backend(backend, points.device.type)  # raises for "native", warns for "auto": there are no native kernels

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from snarfcli.field_docs import documented
 
-__all__ = ["Roots", "drop_duplicates", "invert_3x3"]
+__all__ = ["Roots", "drop_duplicates", "invert_3x3", "is_costly_to_read"]
 
 
 @documented
@@ -45,6 +45,11 @@ def invert_3x3(matrix: Tensor) -> tuple[Tensor, Tensor]:
     determinant = a * first + b * second + c * third
     adjugate = [first, c * h - b * i, b * f - c * e, second, a * i - c * g, c * d - a * f, third, b * g - a * h, a * e - b * d]
     return (torch.stack(adjugate, 1) / determinant[:, None]).reshape(-1, 3, 3), determinant
+
+
+def is_costly_to_read(tensor: Tensor) -> bool:
+    """Return whether reading the values of a tensor would wait for a GPU, or break a graph that is compiled."""
+    return tensor.is_cuda or torch.compiler.is_compiling()
 
 
 def drop_duplicates(roots: Roots, distance: float) -> Roots:

@@ -34,7 +34,7 @@ class SearchConfig:
     max_steps: int = 10
     """Maximum number of steps of Newton's or Broyden's method from one start."""
     divergence: float = 0.25
-    """Residual at which a broyden start is given up, as a share of the longest side of the canonical grid."""
+    """Residual after a step at which a broyden start is given up, as a share of the longest side of the canonical grid."""
     orientation_preserving: bool = False
     """Whether roots are left out where the body is turned inside out (negative determinant of the Jacobian)."""
     backend: str = "auto"

@@ -193,7 +193,7 @@ def blend_transforms(
     """Blend the bone transforms once per grid node and pose.
 
     Args:
-        skinning_weights: [D, H, W, J] at the grid nodes.
+        skinning_weights: [D, H, W, J] at the grid nodes, or [B, D, H, W, J], those of each pose.
         bone_transforms: [B, J, 4, 4], canonical to posed.
         active_cells: [D-1, H-1, W-1], bool; other nodes than their corners may get zeros. None for all.
         backend: "auto", "native" or "reference".
@@ -204,7 +204,12 @@ def blend_transforms(
     Source: Fast-SNARF Eq. 13.
     """
     bones = bone_transforms[:, :, :3].reshape(*bone_transforms.shape[:2], 12)
-    return blend(skinning_weights, bones, active_cells, backend)
+    if skinning_weights.ndim == 4:
+        return blend(skinning_weights, bones, active_cells, backend)
+    if not len(bones):
+        return blend(skinning_weights.sum(0), bones, active_cells, backend)  # nothing, of the right shape
+    poses = zip(skinning_weights, bones.split(1), strict=True)
+    return torch.cat([blend(weights, pose, active_cells, backend) for weights, pose in poses])
 
 
 def interpolate(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:

@@ -46,6 +46,7 @@ class _Broyden(Structure):
         ("tolerance", c_double),
         ("divergence", c_double),
         ("max_steps", c_int32),
+        ("starts_are_points", c_int32),
         ("exact_jacobian", c_int32),
         ("orientation_preserving", c_int32),
     ]
@@ -197,7 +198,8 @@ def broyden_search(
     points, transforms, starts = points.contiguous(), transforms.contiguous(), starts.contiguous()
     length = _longest_side(lower, upper)
     limits = (tolerance * length, divergence * length, max_steps)
-    settings = _Broyden(starts.data_ptr(), starts.shape[1], *limits, exact_jacobian, orientation_preserving)
+    flags = (starts.ndim == 4, exact_jacobian, orientation_preserving)
+    settings = _Broyden(starts.data_ptr(), starts.shape[-2], *limits, *flags)
     found = _search("snarf_broyden_search", _field(transforms, lower, upper, shape), points, settings)
     return fit_to_capacity(*found, points, capacity)
 

@@ -40,7 +40,7 @@ class _Search(Structure):
         *((name, c_double) for name in ("tolerance", "divergence", "same_root")),
         ("nodes", c_int * 3),
         *((name, c_int) for name in ("first_pose", "first_cell", "cells", "bins", "slots", "capacity", "start_count")),
-        *((name, c_int) for name in ("max_steps", "exact_jacobian", "orientation_preserving")),
+        *((name, c_int) for name in ("starts_are_points", "max_steps", "exact_jacobian", "orientation_preserving")),
     ]
 
 
@@ -141,10 +141,11 @@ def run_broyden(
     lower, upper = lower.to(points).contiguous(), upper.to(points).contiguous()
     batch, count = points.shape[:2]
     _check_limits(batch * count, 0)
-    if batch * count == 0 or starts.shape[1] == 0:
+    start_count = starts.shape[-2]
+    if batch * count == 0 or start_count == 0:
         return _nothing(points, capacity)
     arguments = _arguments(points, transforms, lower, upper, shape)
-    arguments.starts, arguments.start_count = starts.data_ptr(), starts.shape[1]
+    arguments.starts, arguments.start_count, arguments.starts_are_points = starts.data_ptr(), start_count, starts.ndim == 4
     arguments.tolerance, arguments.divergence, arguments.max_steps = tolerance, divergence, max_steps
     arguments.exact_jacobian, arguments.orientation_preserving = exact_jacobian, orientation_preserving
     arguments.same_root = _SAME_BROYDEN_ROOT

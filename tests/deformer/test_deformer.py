@@ -16,6 +16,7 @@ from snarfcli.deformer import (
     PresetWeights,
     SearchConfig,
     SkinningConfig,
+    centring,
     correspondences,
     find_correspondences,
     grid_search,
@@ -207,7 +208,8 @@ class Operators(TorchDispatchMode):
 @pytest.mark.parametrize("name", ["distilled", "voxel", "preset"])
 def test_a_search_with_a_capacity_waits_for_nothing(name, monkeypatch):
     """On a GPU, where values are not checked: sizes that depend on data, and numbers read from tensors, would wait."""
-    monkeypatch.setattr(grid_search, "_skips_checks", lambda tensor: True)
+    for reader in (grid_search, centring):
+        monkeypatch.setattr(reader, "is_costly_to_read", lambda tensor: True)
     monkeypatch.setattr(correspondences, "_reading_waits", lambda tensor: True)
     module, other = deformer(name), deformer(name, seed=1)
     cells = torch.ones(5, 6, 7, dtype=torch.bool)

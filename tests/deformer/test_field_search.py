@@ -13,14 +13,23 @@ BONES = 4
 METRE = CanonicalGrid(torch.zeros(3), torch.ones(3))
 
 
-def find(points, transforms, field, *, box=None, start_jacobian="exact", points_at_once=32_768, **settings):
+def find(points, transforms, field, *, starts=None, box=None, start_jacobian="exact", points_at_once=32_768, **settings):
     """Search with the paper's settings, changed by `settings`, lengths in metres; without bounds unless a box is given."""
     grid = box or METRE
     settings = {"tolerance": 1e-5, "max_steps": 50, "divergence": 1.0} | settings
     for name in ("tolerance", "divergence"):
         settings[name] /= grid.longest_side
-    options = {"bounded": box is not None, "start_jacobian": start_jacobian, "points_at_once": points_at_once}
-    return find_correspondences_on_field(points, transforms, field, grid, search=SearchConfig("broyden", **settings), **options)
+    return find_correspondences_on_field(
+        points,
+        transforms,
+        field,
+        grid,
+        starts=starts,
+        search=SearchConfig("broyden", **settings),
+        bounded=box is not None,
+        start_jacobian=start_jacobian,
+        points_at_once=points_at_once,
+    )
 
 
 class DistanceField(nn.Module):
@@ -189,11 +198,11 @@ def test_works_wherever_autograd_is_off_and_under_autocast(scene):
 
 
 def test_rigid_fields_have_one_root_each():
-    """One bone everywhere: the root is B^-1 x', for all start bones; weights may be constants."""
+    """One bone everywhere, weights are constants: the root B^-1 x' is one step away from starts that are not judged."""
     transforms = random_transforms(1, BONES, 1.0)
     points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     only = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
-    found = find(points, transforms, lambda x: only.expand(len(x), -1), divergence=100.0)
+    found = find(points, transforms, lambda x: only.expand(len(x), -1), divergence=1e-6)
     inverse = torch.linalg.inv(transforms[0, 1])
     assert found.query.tolist() == list(range(20))
     torch.testing.assert_close(found.canonical, points[0] @ inverse[:3, :3].T + inverse[:3, 3])
@@ -236,6 +245,74 @@ def test_start_bones_and_orientation():
     assert torch.equal(upright.query, every.query[positive])
 
 
+def test_given_starts_replace_those_of_the_bones(scene):
+    field, transforms, points = scene
+    inverse = torch.linalg.inv(transforms)
+    starts = torch.einsum("bjrc,bnc->bnjr", inverse[..., :3, :3], points) + inverse[:, None, :, :3, 3]
+    wanted = find(points, transforms, field, tolerance=1e-9)
+    found = find(points, transforms, field, tolerance=1e-9, starts=starts)
+    assert torch.equal(found.query, wanted.query)
+    torch.testing.assert_close(found.canonical, wanted.canonical, atol=1e-9, rtol=0)
+    warm = wanted.padded()[0].detach()[:, :, :1] + 1e-3
+    again = find(points, transforms, field, tolerance=1e-9, starts=warm, max_steps=4)
+    assert again.query.tolist() == list(range(80))
+    none = starts.clone()
+    none[..., 0] = torch.nan
+    assert not len(find(points, transforms, field, starts=none).query)
+    assert not len(find(points, transforms, field, starts=starts[:, :, :0]).query)
+
+
+class PosedField(nn.Module):
+    """A distance field whose bone centres are moved by an offset of each pose."""
+
+    def __init__(self, batch: int = 2) -> None:
+        super().__init__()
+        self.shared = DistanceField()
+        generator = torch.Generator().manual_seed(2)
+        self.offsets = nn.Parameter(0.3 * torch.randn(batch, 3, generator=generator, dtype=torch.float64))
+
+    def forward(self, x, pose_index):
+        return self.shared(x - self.offsets.to(x)[pose_index])
+
+
+def test_a_field_of_each_pose(scene):
+    _, transforms, points = scene
+    field = PosedField()
+    together = find(points, transforms, field, tolerance=1e-9)
+    for b in range(2):
+        alone = find(
+            points[b : b + 1], transforms[b : b + 1], lambda x, b=b: field(x, torch.full((len(x),), b)), tolerance=1e-9
+        )
+        assert len(alone.query) > 30
+        assert torch.equal(together.query[together.pose == b] - 40 * b, alone.query)
+        assert torch.equal(together.canonical[together.pose == b], alone.canonical)
+
+
+def test_gradcheck_of_a_field_of_each_pose():
+    field, transforms = PosedField(), random_transforms(2, BONES, 0.15)
+    points = 0.6 * torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) - 0.3
+
+    def roots(points, offsets):
+        def with_offsets(x, pose_index):
+            return torch.func.functional_call(field, {"offsets": offsets}, (x, pose_index))
+
+        return find(points, transforms, with_offsets, tolerance=1e-12).canonical
+
+    inputs = points, field.offsets.detach().clone()
+    assert roots(*inputs).shape == (6, 3)
+    assert torch.autograd.gradcheck(roots, tuple(x.requires_grad_() for x in inputs), eps=1e-6, atol=1e-5, fast_mode=True)
+
+
+def test_a_field_that_holds_inference_tensors(scene):
+    field, transforms, points = scene
+    wanted = find(points, transforms, field)
+    with torch.inference_mode():
+        moved = transforms.clone()
+        offset = torch.zeros(3, dtype=torch.float64)
+        found = find(points.clone(), moved, lambda x: field(x + offset))
+    assert torch.equal(found.canonical, wanted.canonical)
+
+
 @pytest.mark.parametrize(("batch", "count"), [(0, 5), (2, 0), (1, 1)])
 def test_few_points(batch, count):
     field, transforms = DistanceField(), random_transforms(batch, BONES, 0.2)
@@ -263,6 +340,8 @@ def test_few_points(batch, count):
         ({"start_jacobian": "rough"}, "start_jacobian: wanted exact or blended, got 'rough'"),
         ({"search": SearchConfig("broyden", tolerance=0.0)}, "search.tolerance: wanted more than 0, got 0.0"),
         ({"search": "complete"}, "search.name: wanted broyden, got 'complete': a field has no cells"),
+        ({"starts": torch.zeros(2, 2, 1, 3)}, r"starts: wanted shape \[1, 2, I, 3\] to fit points, got \[2, 2, 1, 3\]"),
+        ({"starts": torch.zeros(1, 2, 1, 3), "search": SearchConfig("broyden", [0])}, "search.init_bones: wanted None beside"),
         ({"points_at_once": 0}, "points_at_once: wanted at least 1, got 0"),
     ],
 )

@@ -20,8 +20,8 @@ from snarfcli.deformer import (
     find_correspondences,
     ops,
 )
-from snarfcli.deformer.grid_search import _start_transforms
 from snarfcli.deformer.skinning import blend_transforms
+from snarfcli.deformer.starts import start_transforms
 from snarfcli.native import cpu, cuda, cuda_compile, cuda_driver, cuda_launches
 from snarfcli.native.library import native_library
 
@@ -178,7 +178,7 @@ def test_broyden_search_equals_the_reference(runner, dtype, exact):
     points, poses, weights, grid, transforms = scene(6, 0.4, dtype, batch=3)
     search = SearchConfig("broyden", [0, 2, 5], "exact" if exact else "broyden", backend="reference")
     wanted = find_correspondences(points, poses, weights, grid, search=search)
-    starts = _start_transforms(poses, [0, 2, 5])
+    starts = start_transforms(poses, [0, 2, 5])
     found = runner.broyden(points, transforms, starts, grid, SHAPE, exact_jacobian=exact)
     assert int(found[3]) == len(found[1])
     # Roots are only as exact as the tolerance, 1e-5 m; a start near the limit of the steps may go either way.
@@ -202,7 +202,7 @@ def test_orientation_preserving_roots_only(runner):
     assert 0 < int(keep.sum()) < len(keep)
     for mine, theirs in zip(preserving[:3], everything[:3], strict=True):
         assert torch.equal(mine, theirs[keep])
-    starts = _start_transforms(poses, None)
+    starts = start_transforms(poses, None)
     preserving = runner.broyden(points, transforms, starts, grid, SHAPE, orientation_preserving=True)
     assert len(preserving[1])
     assert bool((torch.linalg.det(preserving[2]) > 0).all())
@@ -231,7 +231,7 @@ def test_result_does_not_depend_on_the_size_of_a_block(emulated, block, dtype, m
     assert len(one[1]) > 300
     many = Runner("emulated", block).complete(points, transforms, grid, (3, 4, 4))
     assert all(torch.equal(a, b) for a, b in zip(one, many, strict=True))
-    starts = _start_transforms(poses, [0, 1, 2])
+    starts = start_transforms(poses, [0, 1, 2])
     one = emulated.broyden(points, transforms, starts, grid, (3, 4, 4))
     many = Runner("emulated", block).broyden(points, transforms, starts, grid, (3, 4, 4))
     assert all(torch.equal(a, b) for a, b in zip(one, many, strict=True))
@@ -256,7 +256,7 @@ def test_result_does_not_depend_on_batch_groups_or_guesses(runner, monkeypatch):
 
 def test_capacity_pads_cuts_and_counts(runner):
     points, poses, _, grid, transforms = scene(24, 0.7, batch=2)
-    starts = _start_transforms(poses, None)
+    starts = start_transforms(poses, None)
     for run, start in ((runner.complete, ()), (runner.broyden, (starts,))):
         whole = run(points, transforms, *start, grid, SHAPE)
         rows = len(whole[1])
@@ -291,7 +291,7 @@ def test_slots_that_run_out_are_counted_and_not_overrun(emulated, monkeypatch):
 def test_few_queries_and_poses(runner, batch, count):
     _, poses, _weights, grid, transforms = scene(3, 0.4, batch=2, count=1)
     points, transforms = torch.zeros(batch, count, 3).double(), transforms[:batch]
-    starts = _start_transforms(poses, None)[:batch]
+    starts = start_transforms(poses, None)[:batch]
     for found in (
         runner.complete(points, transforms, grid, SHAPE),
         runner.broyden(points, transforms, starts, grid, SHAPE),
@@ -333,7 +333,7 @@ def test_queries_that_are_not_finite_or_far_away(runner):
     strange = [torch.nan, torch.inf, -torch.inf, 1e38, -1e38, 1e6, 50.0]
     more = torch.tensor([[value, 0.1, 0.2] for value in strange] + [[0.0, 0.0, value] for value in strange])
     mixed = torch.cat([more.expand(2, -1, 3), points], 1)
-    starts = _start_transforms(poses, None)
+    starts = start_transforms(poses, None)
     for found, wanted in (
         (runner.complete(mixed, transforms, grid, SHAPE), whole),
         (runner.broyden(mixed, transforms, starts, grid, SHAPE), runner.broyden(points, transforms, starts, grid, SHAPE)),

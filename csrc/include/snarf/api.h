@@ -43,10 +43,13 @@ typedef struct snarf_complete {
 } snarf_complete;
 
 typedef struct snarf_broyden {
-  const void* starts;           /* rows of the inverse bone transforms that give a start, [B, I, 12], posed to canonical */
+  /* Upper rows of the inverse bone transforms that give a start, [B, I, 12], posed to canonical; or, with starts_are_points,
+   * canonical points, [B, N, I, 3], metres, of which one that is not finite is no start. */
+  const void* starts;
   int64_t count;                /* I */
   double tolerance, divergence; /* metres */
   int32_t max_steps;
+  int32_t starts_are_points;
   int32_t exact_jacobian;
   int32_t orientation_preserving;
 } snarf_broyden;

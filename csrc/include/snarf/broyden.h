@@ -13,10 +13,17 @@ namespace SNARF_ISA {
 template <class S>
 struct Broyden {
   S tolerance;   // largest residual of a root, metres
-  S divergence;  // residual at which a start is given up, metres
+  S divergence;  // residual after a step at which a start is given up, metres
   int max_steps;
   bool exact_jacobian;
 };
+
+// The start x[3] that the upper rows [12] of an inverse bone transform give for a query, canonical.
+template <class S>
+SNARF_HD void start_from(const S* back, const S* target, S* x) {
+  for (int i = 0; i < 3; ++i)
+    x[i] = back[4 * i] * target[0] + back[4 * i + 1] * target[1] + back[4 * i + 2] * target[2] + back[4 * i + 3];
+}
 
 // Blended transform [12] at the canonical point x, and on request its three derivatives by the cell coordinates, [3][12].
 template <class S>
@@ -89,7 +96,9 @@ SNARF_HD bool broyden(const S* transforms, const Grid<S>& grid, const Broyden<S>
   for (int k = 0;; ++k) {
     S distance2 = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2];
     if (distance2 < tolerance2) break;
-    if (k == settings.max_steps || !(distance2 < divergence2)) return false;
+    // As SNARF does, the residual of the start itself is not judged: the first step may lead far closer. It must be finite.
+    const bool hopeful = k ? distance2 < divergence2 : distance2 - distance2 == 0;
+    if (k == settings.max_steps || !hopeful) return false;
     S step[3], change[3], towards[3], row[3];
     for (int i = 0; i < 3; ++i) {
       S moved = x[i] - (inverse[3 * i] * residual[0] + inverse[3 * i + 1] * residual[1] + inverse[3 * i + 2] * residual[2]);

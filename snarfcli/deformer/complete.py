@@ -1,38 +1,121 @@
-"""Complete correspondence search: the roots of d(x) = x' in the grid, cell by cell.
+"""Complete correspondence search: every root of d(x) = x' in the grid, cell by cell, without start bones.
 
-Inside one cell T(x) is a convex combination of the eight corner transforms T_k, so d(cell) lies inside the box spanned by
-T_k [x; 1] over the corners k and the x of the cell. Only queries inside that box can have a root in the cell. The first step of
-Newton's method from the cell's centre needs only the value and the inverse Jacobian at the centre, which all queries of a cell
-share. If it leads too far out of the cell, given how curved the field is in it, the pair is dropped. The remaining pairs, about
-three per root while an avatar trains, are solved with the exact Jacobian of the trilinear field. There are no start bones, and
-a query outside all boxes is known to have no correspondence.
+Only a query inside the box around a cell's posed image can have a root in the cell; a query outside all boxes is known to have
+no correspondence. Newton's first step from the cell's centre needs only the inverse Jacobian there, which all queries of the
+cell share. If it leads farther from the centre than the cell's curvature can explain, the pair of query and cell is dropped. In
+a cell of little curvature a query has at most one root, and one start finds it. Other cells (next to a fold, where det J
+changes sign, they always are) are cut into eight, again and again, and what is left gets several starts.
 
-This is the readable version in PyTorch, for tensors without a native kernel. Unlike the native kernels
-(csrc/include/snarf/cell.h) it may miss two kinds of roots: a second root of a query in one cell, where the determinant of the
-Jacobian changes sign and one start is not enough; and a root in a cell that is more curved between its corners than _CURVED and
-_SLACK allow for.
+This is the readable version in PyTorch, for tensors without a native kernel. The native kernels (csrc/include/snarf/cell.h,
+csrc/cpu/kernels.cpp) find the same roots.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
+from snarfcli.deformer.candidates import pairs_in_boxes
+from snarfcli.deformer.cell_polynomials import (
+    FACE_TOLERANCE,
+    bound_boxes,
+    bound_roots,
+    cell_polynomials,
+    cut_cells,
+    evaluate,
+    inverse_of,
+    pick,
+)
 from snarfcli.deformer.grid import CORNERS, CanonicalGrid, cell_corners
-from snarfcli.deformer.roots import Roots, drop_duplicates, invert_3x3
-from snarfcli.deformer.skinning import forward_jacobian
+from snarfcli.deformer.roots import Roots, drop_duplicates
 
 __all__ = ["complete_roots", "posed_cell_boxes"]
 
 _QUERIES_AT_ONCE = 65_536  # bounds the memory: a query has several candidate cells
-_CELLS_AT_ONCE = 200_000  # bounds the memory: 400 bytes of corner transforms per cell, and as much per intermediate result
-_BINS_PER_SIDE = 96
-_STRAY = 0.75  # of a cell; a candidate this far outside its cell is dropped, a neighbour finds the root if there is one
-_CURVED = 2.0  # bound of the field's deviation from linear inside a cell, in units of that at its corners
-_SLACK = 0.1  # of a cell, beyond that
-_FACE_TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-9}  # of a cell; rounding may put a root on a face outside both
-_POLISH = 1e-2  # of a cell; a step this short does not change the Jacobian noticeably
+_CELLS_AT_ONCE = 65_536  # bounds the memory: 400 bytes of corner transforms per cell, and as much per intermediate result
+_PAIRS_AT_ONCE = 8192  # of a query and a cell, 400 bytes each: stays in a processor's cache, and bounds the memory for parts
+_TAME = 0.9  # largest curvature of a cell that is solved from one start, as in csrc/include/snarf/search.h
+_LEVELS = 4  # how often other cells are cut
+_STRAY = 0.75  # of a cell; a start that leads this far out of its cell is given up, a neighbour finds the root if there is one
+_LAST_STEP = {torch.float32: 2e-4, torch.float64: 1e-7}  # of a cell; so short a step leaves the root and its Jacobian exact
+_TRUSTED = 1e-2  # of a cell; beside a fold, where no step is short, the longest that a point with a small residual still takes
 _SAME_ROOT = 5e-3  # of a cell; Newton's last step leaves errors a hundred times smaller
+
+
+@dataclass
+class _Cells:
+    """Grid cells in one or several poses, or equal parts of them."""
+
+    polynomials: Tensor
+    """[3, 3, 3, 3, C], see `cell_polynomials`."""
+    centres: Tensor
+    """[3, C], canonical, metres."""
+    numbers: Tensor
+    """[C], flat index of the grid cell."""
+    size: Tensor
+    """[3], metres."""
+    level: int = 0
+    """How often the grid cells were cut."""
+
+    def take(self, index: Tensor) -> _Cells:
+        """Return the cells at `index` [K]."""
+        polynomials, centres = pick(self.polynomials, index), pick(self.centres, index)
+        return _Cells(polynomials, centres, pick(self.numbers, index), self.size, self.level)
+
+    def cut(self) -> _Cells:
+        """Return the eighths of all cells, eighth k of cell c at k * C + c."""
+        half = self.size / 2
+        shifts = (CORNERS.to(half) - 0.5) * half
+        centres = (self.centres[:, None] + shifts.T[..., None]).flatten(1)
+        return _Cells(cut_cells(self.polynomials).flatten(4), centres, self.numbers.repeat(8), half, self.level + 1)
+
+
+@dataclass
+class _Pairs:
+    """Pairs of a query and a cell."""
+
+    query: Tensor
+    """[P], index of the query."""
+    cell: Tensor
+    """[P], index of the cell."""
+    start: Tensor
+    """[3, P], where to look for the root first, cell coordinates."""
+
+    def take(self, index: Tensor) -> _Pairs:
+        """Return the pairs at `index` [K]."""
+        return _Pairs(pick(self.query, index), pick(self.cell, index), pick(self.start, index))
+
+    def split(self) -> Iterator[_Pairs]:
+        """Yield the pairs, few at once."""
+        parts = (values.split(_PAIRS_AT_ONCE, -1) for values in (self.query, self.cell, self.start))
+        return (_Pairs(*some) for some in zip(*parts, strict=True))
+
+
+@dataclass
+class _Solver:
+    """Settings of Newton's method."""
+
+    tolerance: float
+    """Largest residual of a root, metres."""
+    max_steps: int
+    """Maximum number of steps from one start."""
+
+
+@dataclass
+class _Found:
+    """Roots, in any order."""
+
+    query: Tensor
+    """[M]."""
+    numbers: Tensor
+    """[M], flat index of the grid cell."""
+    canonical: Tensor
+    """[3, M], metres."""
+    inverse: Tensor
+    """[3, 3, M], of dd/dx at the root."""
 
 
 def complete_roots(
@@ -54,41 +137,33 @@ def complete_roots(
         shape: nodes (D, H, W).
         active_cells: [D-1, H-1, W-1], bool, cells to search; None for all.
         tolerance: largest residual of a root, metres.
-        max_steps: maximum number of Newton steps in one cell.
+        max_steps: maximum number of Newton steps from one start.
 
     Returns:
-        The roots of all queries, without duplicates.
+        The roots of all queries, without duplicates; those of one query in the order of their cells.
     """
     batch, count = points.shape[:2]
     if active_cells is None:
-        cells = torch.arange((shape[0] - 1) * (shape[1] - 1) * (shape[2] - 1), device=points.device)
+        numbers = torch.arange((shape[0] - 1) * (shape[1] - 1) * (shape[2] - 1), device=points.device)
     else:
-        cells = active_cells.reshape(-1).nonzero()[:, 0]
-    corners = cell_corners(cells, shape)
-    origins = grid.nodes(shape).reshape(-1, 3)[corners[:, 0]]
-    size = grid.cell_size(shape)
+        numbers = active_cells.reshape(-1).nonzero()[:, 0]
+    solver = _Solver(tolerance, max_steps)
+    found = [_Found(numbers[:0], numbers[:0], points.new_empty(3, 0), points.new_empty(3, 3, 0))]
     # Several poses are processed together, as far as memory allows.
-    poses_at_once = max(1, min(_CELLS_AT_ONCE // max(len(cells), 1), _QUERIES_AT_ONCE // max(count, 1)))
-    parts = []
-    for first in range(0, batch, poses_at_once):
-        some = transforms[first : first + poses_at_once]
-        corner_transforms = some[:, corners].reshape(-1, 8, 12)
-        places = origins.repeat(len(some), 1)
-        boxes = posed_cell_boxes(corner_transforms, places, size)
-        centres = _centres(corner_transforms, places, size)
-        for start in range(0, max(count, 1), _QUERIES_AT_ONCE):
-            queries = points[first : first + len(some), start : start + _QUERIES_AT_ONCE]
-            flat = queries.reshape(-1, 3)
-            query, cell = _candidates(queries, *boxes)
-            query, cell, local = _first_step(flat, query, cell, *centres)
-            roots = _newton(flat, query, cell, local, corner_transforms, places, size, tolerance, max_steps)
-            width = max(queries.shape[1], 1)
-            roots.query = (first + roots.query // width) * count + start + roots.query % width
-            parts.append(drop_duplicates(roots, _SAME_ROOT * float(size.min())))
-    if not parts:
-        nothing = cells[:0], cells[:0], points.new_empty(0, 3)
-        return _newton(points.reshape(-1, 3), *nothing, transforms.new_empty(0, 8, 12), origins, size, 0.0, 0)
-    return Roots.concatenate(parts)
+    poses_at_once = max(1, min(_CELLS_AT_ONCE // max(len(numbers), 1), _QUERIES_AT_ONCE // max(count, 1)))
+    for first in range(0, batch if count else 0, poses_at_once):
+        poses = slice(first, first + poses_at_once)
+        for some in numbers.split(_CELLS_AT_ONCE):
+            cells = _cells_of(transforms[poses], some, grid, shape)
+            boxes = _posed_boxes(cells.polynomials)
+            for start in range(0, count, _QUERIES_AT_ONCE):
+                queries = points[poses, start : start + _QUERIES_AT_ONCE]
+                flat, width = queries.reshape(-1, 3).T.contiguous(), queries.shape[1]
+                for query, cell in pairs_in_boxes(flat, *boxes, len(queries)):
+                    for part in _search(flat, query, cell, cells, solver):
+                        part.query = (first + part.query // width) * count + start + part.query % width
+                        found.append(part)
+    return _sorted(found, _SAME_ROOT * float(grid.cell_size(shape).min()))
 
 
 def posed_cell_boxes(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor]:
@@ -99,142 +174,134 @@ def posed_cell_boxes(corner_transforms: Tensor, origins: Tensor, cell_size: Tens
         origins: [C, 3], canonical position of each cell's first corner, metres.
         cell_size: [3], metres.
     """
-    start, sides = _images(corner_transforms, origins, cell_size)
-    return (start + sides.clamp(max=0).sum(-1)).amin(1), (start + sides.clamp(min=0).sum(-1)).amax(1)
+    lower, upper = _posed_boxes(cell_polynomials(corner_transforms, (origins + cell_size / 2).T, cell_size))
+    return lower.T, upper.T
 
 
-def _images(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the images of the cell's first corner, [C, 8, 3], and of its sides, [C, 8, 3, 3], under each corner's transform.
-
-    Column i of the sides is the image of the cell's side along axis i.
-    """
-    rows = corner_transforms.reshape(len(corner_transforms), 24, 4)
-    homogeneous = torch.cat([origins, torch.ones_like(origins[:, :1])], 1)
-    start = torch.bmm(rows, homogeneous[:, :, None]).reshape(-1, 8, 3)
-    return start, rows.reshape(-1, 8, 3, 4)[..., :3] * cell_size
+def _cells_of(transforms: Tensor, numbers: Tensor, grid: CanonicalGrid, shape: tuple[int, int, int]) -> _Cells:
+    """Return cells in G poses, one pose after the other, from the transforms [G, D * H * W, 12] of the nodes."""
+    corners, size = cell_corners(numbers, shape), grid.cell_size(shape)
+    centres = grid.nodes(shape).reshape(-1, 3)[corners[:, 0]] + size / 2
+    centres = centres.T.repeat(1, len(transforms))
+    polynomials = cell_polynomials(transforms[:, corners].reshape(-1, 8, 12), centres, size)
+    return _Cells(polynomials, centres, numbers.repeat(len(transforms)), size)
 
 
-def _candidates(points: Tensor, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """Return all pairs (query [P], cell [P]) of the same pose where the query lies in the cell's posed box, cell by cell.
+def _posed_boxes(polynomials: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the boxes (lower [3, C], upper [3, C]) of cells."""
+    centre, half = polynomials[0, 0, 0], bound_boxes(polynomials)
+    return centre - half, centre + half
 
-    The queries are sorted into uniform bins, x fastest, so that a run of bins along x is one contiguous range of queries.
+
+def _search(points: Tensor, query: Tensor, cell: Tensor, cells: _Cells, solver: _Solver) -> Iterator[_Found]:
+    """Yield the roots of queries in cells.
 
     Args:
-        points: [G, N, 3], queries of G poses; numbered g * N + n in the result.
-        lower, upper: [G * C, 3], boxes of C cells in each pose; numbered g * C + c in the result.
+        points: [3, N], queries.
+        query, cell: [P], indices of pairs with the query in the cell's posed box, cell by cell.
+        cells: the cells.
+        solver: settings.
     """
-    poses, count = points.shape[:2]
-    flat = points.reshape(-1, 3)
-    boxed = (lower.isfinite() & upper.isfinite()).all(1)
-    if not len(flat) or not bool(boxed.any()):
-        nothing = torch.empty(0, dtype=torch.long, device=points.device)
-        return nothing, nothing
-    # Queries outside every box need no bin; comparisons with non-finite ones are false.
-    known = ((flat >= lower[boxed].amin(0)) & (flat <= upper[boxed].amax(0))).all(1).nonzero()[:, 0]
-    if not len(known):
-        return known, known
-    near = flat[known]
-    first, last = near.amin(0), near.amax(0)
-    side = max(float((last - first).max()) / _BINS_PER_SIDE, float((upper - lower)[boxed].mean()), 1e-9)
-    bins = ((last - first) / side).long() + 1
-    place = ((near - first) / side).long().minimum(bins - 1)
-    pose = known // count
-    key = ((pose * bins[2] + place[:, 2]) * bins[1] + place[:, 1]) * bins[0] + place[:, 0]
-    order = torch.argsort(key, stable=True)
-    near, known = near[order], known[order]
-    begin = torch.zeros(poses * int(bins.prod()) + 1, dtype=torch.long, device=points.device)
-    begin[1:] = torch.bincount(key, minlength=len(begin) - 1).cumsum(0)
-
-    touched = (boxed & (upper >= first).all(1) & (lower <= last).all(1)).nonzero()[:, 0]
-    low = ((lower[touched] - first) / side).clamp_min(0).long().minimum(bins - 1)
-    high = ((upper[touched] - first) / side).clamp_min(0).long().minimum(bins - 1)
-    rows = high[:, 1:] - low[:, 1:] + 1
-    owner, nth = _expand(rows.prod(1))
-    y = low[owner, 1] + nth % rows[owner, 0]
-    z = low[owner, 2] + nth // rows[owner, 0]
-    cells_per_pose = len(lower) // poses
-    row = ((touched[owner] // cells_per_pose * bins[2] + z) * bins[1] + y) * bins[0]
-    row_begin, row_end = begin[row + low[owner, 0]], begin[row + high[owner, 0] + 1]
-    range_owner, nth = _expand(row_end - row_begin)
-    at = row_begin[range_owner] + nth
-    cell = touched[owner[range_owner]]
-    candidates = near.index_select(0, at)
-    above, below = candidates >= lower.index_select(0, cell), candidates <= upper.index_select(0, cell)
-    inside = (above & below).all(1).nonzero()[:, 0]
-    return known[at[inside]], cell[inside]
+    used, cell = cell.unique_consecutive(return_inverse=True)
+    cells = cells.take(used)
+    pairs, tame = _possible(points, query, cell, cells)
+    yield from _solve(points, pairs.take(tame.nonzero()[:, 0]), cells, solver)
+    for some in pairs.take((~tame).nonzero()[:, 0]).split():
+        if cells.level == _LEVELS:
+            yield from _solve(points, _with_many_starts(some), cells, solver)
+        else:
+            yield from _search(points, *_pairs_with_eighths(points, some, cells), solver)
 
 
-def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Return, for each of counts.sum() items, the index of its owner and its number within the owner."""
-    owner = torch.repeat_interleave(counts)
-    return owner, torch.arange(len(owner), device=counts.device) - (counts.cumsum(0) - counts)[owner]
+def _possible(points: Tensor, query: Tensor, cell: Tensor, cells: _Cells) -> tuple[_Pairs, Tensor]:
+    """Return the pairs that Newton's first step from the centre does not rule out, and whether their cells are tame, [P]."""
+    bounds = bound_roots(cells.polynomials, cells.level)
+    kept = [_Pairs(query[:0], cell[:0], points[:, :0])]
+    for some in _Pairs(query, cell, points.new_empty(0, len(query))).split():
+        offset = pick(points, some.query) - pick(cells.polynomials[0, 0, 0], some.cell)
+        some.start = (pick(bounds.inverse, some.cell) * offset).sum(1)
+        kept.append(some.take((some.start.abs() <= pick(bounds.reach, some.cell)).all(0).nonzero()[:, 0]))
+    pairs = _Pairs(*(torch.cat([getattr(part, name) for part in kept], -1) for name in ("query", "cell", "start")))
+    return pairs, pick(bounds.curvature < _TAME, pairs.cell)
 
 
-def _centres(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the values at cell centres that the first Newton step needs.
-
-    Returns:
-        Posed centres [C, 3], metres; inverse Jacobians [C, 3, 3] there, to cell coordinates; and the largest length of that
-        step, in cell coordinates, at which the cell can still hold a root, [C].
-    """
-    middle = torch.full_like(origins, 0.5)
-    posed, jacobian = forward_jacobian(corner_transforms, middle, origins, cell_size)
-    inverse, _ = invert_3x3(jacobian)
-    start, sides = _images(corner_transforms, origins, cell_size)
-    offsets = CORNERS.to(cell_size)
-    posed_corners = start + (sides * offsets[:, None]).sum(-1)
-    linear = torch.bmm(posed_corners - posed[:, None], inverse.transpose(1, 2)) + 0.5
-    deviation = (linear - offsets).abs().amax((1, 2))
-    reach = 0.5 + _CURVED * deviation + _SLACK
-    return posed, inverse, torch.where(reach.isfinite(), reach, torch.inf)
+def _pairs_with_eighths(points: Tensor, pairs: _Pairs, cells: _Cells) -> tuple[Tensor, Tensor, _Cells]:
+    """Cut the cells of pairs into eight; return pairs (query [K], eighth [K]) that may hold a root, and the eighths."""
+    whole, place = pairs.cell.unique_consecutive(return_inverse=True)
+    eighths = cells.take(whole).cut()
+    cell = place + len(whole) * torch.arange(8, device=place.device)[:, None]  # [8, P]
+    offset = pick(points, pairs.query)[:, None] - eighths.polynomials[0, 0, 0][:, cell]
+    inside = (offset.abs() <= bound_boxes(eighths.polynomials, eighths.level)[:, cell]).all(0)
+    return pairs.query.expand(8, -1)[inside], cell[inside], eighths
 
 
-def _first_step(
-    points: Tensor, query: Tensor, cell: Tensor, centres: Tensor, inverse: Tensor, reach: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Take Newton's step from the centre for each pair; return the pairs that may be roots and their positions, [P, 3]."""
-    offset = points.index_select(0, query) - centres.index_select(0, cell)
-    step = torch.bmm(inverse.index_select(0, cell), offset[:, :, None])[:, :, 0].nan_to_num(0, 0, 0)
-    possible = (step.abs().amax(1) <= reach[cell]).nonzero()[:, 0]
-    return query[possible], cell[possible], 0.5 + step[possible].clamp(-0.75, 0.75)
+def _with_many_starts(pairs: _Pairs) -> _Pairs:
+    """Return each pair ten times: with its own start, the cell's centre and its corners."""
+    corners = CORNERS.to(pairs.start) - 0.5
+    fixed = torch.cat([torch.zeros_like(corners[:1]), corners]).T
+    starts = torch.cat([pairs.start[:, None], fixed[..., None].expand(-1, -1, len(pairs.query))], 1)
+    copies = starts.shape[1]
+    return _Pairs(pairs.query.repeat(copies), pairs.cell.repeat(copies), starts.flatten(1))
 
 
-def _newton(
-    points: Tensor,
-    query: Tensor,
-    cell: Tensor,
-    local: Tensor,
-    corner_transforms: Tensor,
-    origins: Tensor,
-    cell_size: Tensor,
-    tolerance: float,
-    max_steps: int,
-) -> Roots:
-    """Run Newton's method from `local` for each pair of query and cell; keep roots in the cell.
+def _solve(points: Tensor, pairs: _Pairs, cells: _Cells, solver: _Solver) -> Iterator[_Found]:
+    """Yield the roots that Newton's method finds from the starts of pairs."""
+    size = cells.size[:, None]
+    for some in pairs.split():
+        residuals = pick(cells.polynomials, some.cell)
+        residuals[0, 0, 0] -= pick(points, some.query)
+        for index, local, inverse in _newton(residuals, some.start.clamp(-0.5, 0.5), cells.level, solver):
+            cell = pick(some.cell, index)
+            canonical = pick(cells.centres, cell) + size * local
+            yield _Found(pick(some.query, index), pick(cells.numbers, cell), canonical, inverse * size[..., None])
+
+
+def _newton(residuals: Tensor, local: Tensor, level: int, solver: _Solver) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Run Newton's method for a root of each polynomial in its cell.
+
+    Args:
+        residuals: [3, 3, 3, 3, P], polynomials of d(s) - x'.
+        local: [3, P], starts, cell coordinates.
+        level: how often the cells were cut.
+        solver: settings.
+
+    Yields:
+        The indices [M] of polynomials with a root, the root [3, M], and the inverse [3, 3, M] of dd/ds there.
 
     Source: SNARF Eq. 6, with the exact Jacobian.
     """
-    reach = 0.5 + _FACE_TOLERANCE[points.dtype]
-    found = [(query[:0], cell[:0], local[:0], points.new_empty(0, 3, 3))]
-    for _ in range(max_steps):
-        if not len(query):
-            break
-        corners = corner_transforms.index_select(0, cell)
-        posed, jacobian = forward_jacobian(corners, local, origins.index_select(0, cell), cell_size)
-        residual = posed - points.index_select(0, query)
-        inverse, _ = invert_3x3(jacobian)
-        step = torch.bmm(inverse, residual[:, :, None])[:, :, 0]
-        longest = step.abs().amax(1, keepdim=True)
+    dtype = local.dtype
+    reach = 0.5 + FACE_TOLERANCE[dtype] * 2**level
+    index = torch.arange(local.shape[1], device=local.device)
+    for steps in range(1, solver.max_steps + 1):
+        is_last = steps == solver.max_steps
+        residual, *derivatives = evaluate(residuals, local)
+        inverse, _ = inverse_of(*derivatives)
+        step = (inverse * residual).sum(1)
+        longest = step.abs().amax(0)
         # Where the Jacobian is singular there is no inverse to report.
-        converged = (residual.norm(dim=1) < tolerance) & longest[:, 0].isfinite()
-        # A last, tiny step polishes a converged root; beside a fold, where it is not tiny, the point stays where it is.
-        trusted = (~converged)[:, None] | (longest < _POLISH)
-        local = torch.where(trusted, local - step / longest.clamp_min(1), local)
-        from_centre = (local - 0.5).abs().amax(1)
+        is_exact = longest < (torch.inf if is_last else _LAST_STEP[dtype])
+        converged = (residual.square().sum(0) < solver.tolerance**2) & is_exact
+        moves = longest < _TRUSTED if is_last else torch.ones_like(converged)
+        local = torch.where(moves, local - step / longest.clamp_min(1), local)
+        from_centre = local.abs().amax(0)
         done = (converged & (from_centre <= reach)).nonzero()[:, 0]
-        found.append((query[done], cell[done], local[done], inverse[done] * cell_size[:, None]))
+        yield pick(index, done), pick(local, done), pick(inverse, done)
         # Steps grow shorter towards a root: one that ends farther outside the cell than its length will not return.
-        going = (~converged & (from_centre - 0.5 < longest[:, 0].clamp_max(_STRAY))).nonzero()[:, 0]
-        query, cell, local = (pairs.index_select(0, going) for pairs in (query, cell, local))
-    query, cell, local, inverse = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return Roots(origins[cell] + local * cell_size, query, inverse)
+        going = (~converged & (from_centre - 0.5 <= longest.clamp_max(_STRAY))).nonzero()[:, 0]
+        if not len(going):
+            return
+        index, local, residuals = (pick(values, going) for values in (index, local, residuals))
+
+
+def _sorted(found: list[_Found], same: float) -> Roots:
+    """Return the roots sorted by query and cell, without duplicates: those closer together than `same`, metres."""
+    numbers, query = (torch.cat([getattr(part, name) for part in found]) for name in ("numbers", "query"))
+    canonical = torch.cat([part.canonical for part in found], 1)
+    inverse = torch.cat([part.inverse for part in found], 2)
+    order = torch.argsort(canonical[0])
+    for key in (numbers, query):
+        order = order[torch.argsort(key[order], stable=True)]
+    roots = Roots(pick(canonical, order).T, query[order], pick(inverse, order).permute(2, 0, 1))
+    # The two roots beside a fold may be close together too, but differ in orientation.
+    return drop_duplicates(roots, same, by_orientation=True)

@@ -32,7 +32,7 @@ class Roots:
 
     def take(self, index: Tensor) -> Roots:
         """Return the roots at `index` [K]."""
-        return Roots(*(field[index] for field in vars(self).values()))
+        return Roots(*(field.index_select(0, index) for field in vars(self).values()))
 
 
 def invert_3x3(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -52,19 +52,25 @@ def is_costly_to_read(tensor: Tensor) -> bool:
     return tensor.is_cuda or torch.compiler.is_compiling()
 
 
-def drop_duplicates(roots: Roots, distance: float) -> Roots:
+def drop_duplicates(roots: Roots, distance: float, *, by_orientation: bool = False) -> Roots:
     """Sort roots by query and keep one of those of the same query that lie closer together than `distance`, metres.
 
     Neighbouring cells both report a root on their common face, and several starts reach the same root.
+
+    Args:
+        roots: in any order.
+        distance: metres.
+        by_orientation: keep both of two close roots if the determinants of their Jacobians differ in sign.
     """
     order = torch.argsort(roots.query, stable=True)
     roots = roots.take(order)
     keep = torch.ones(len(order), dtype=torch.bool, device=order.device)
+    kind = invert_3x3(roots.jacobian_inverse)[1] > 0 if by_orientation else keep.clone()
     # Roots of one query stand side by side, so comparing each with the k-th before it, for growing k, meets all pairs.
     for k in range(1, len(order)):
         same = roots.query[k:] == roots.query[:-k]
         if not bool(same.any()):
             break
         close = (roots.canonical[k:] - roots.canonical[:-k]).norm(dim=1) < distance
-        keep[k:] &= ~(same & close & keep[:-k])
+        keep[k:] &= ~(same & close & (kind[k:] == kind[:-k]) & keep[:-k])
     return roots.take(keep.nonzero()[:, 0])

@@ -27,7 +27,7 @@ def test_the_native_library_is_loaded():
 @pytest.mark.parametrize("search", ["complete", "broyden"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_native_and_reference_agree(search, dtype):
-    """In poses without folds, where the reference misses nothing."""
+    """Roots and gradients, in poses without folds, beside which gradients have no bound."""
     points, transforms, weights = scene(dtype, angle=0.1)
     weights.requires_grad_()
     points.requires_grad_()
@@ -49,11 +49,12 @@ def test_native_and_reference_agree(search, dtype):
         assert (mine - theirs).norm() <= 2e-3 * theirs.norm()
 
 
+@pytest.mark.parametrize("backend", ["native", "reference"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(
     ("bones", "angle", "shape"), [(2, 1.5, (5, 7, 9)), (24, 1.0, (6, 9, 17)), (55, 1.2, (12, 9, 8)), (5, 2.5, (2, 2, 2))]
 )
-def test_every_root_is_found(dtype, bones, angle, shape):
+def test_every_root_is_found(backend, dtype, bones, angle, shape):
     """Folds included, where one cell holds several roots; only queries on the verge of a fold are left out."""
     weights = smooth_weights(shape, bones, 3, dtype)
     transforms = random_transforms(1, bones, angle, 5, dtype)
@@ -62,7 +63,8 @@ def test_every_root_is_found(dtype, bones, angle, shape):
     truth = true_roots(
         *(t.double().numpy() for t in (points, weights, transforms[0])), grid.lower.numpy(), grid.upper.numpy(), seam=2e-5
     )
-    found = find_correspondences(points[None], transforms, weights, unit_grid(dtype), check=False)
+    search = SearchConfig(backend=backend)
+    found = find_correspondences(points[None], transforms, weights, unit_grid(dtype), search=search, check=False)
     query, canonical = found.query.numpy(), found.canonical.double().numpy()
     settled = np.flatnonzero(~truth.seam)
     assert len(settled) > 300

@@ -20,23 +20,23 @@ def same_roots(found, truth):
     return hits, bool((torch.cdist(found, truth).amin(1) < 1e-5).all()) if len(found) else True
 
 
+@pytest.mark.parametrize("backend", ["native", "reference"])
 @pytest.mark.parametrize(("bones", "angle"), [(2, 0.3), (2, 1.2), (24, 0.5), (55, 0.4)])
-def test_complete_search_finds_what_exhaustive_search_finds(bones, angle):
+def test_complete_search_finds_what_exhaustive_search_finds(bones, angle, backend):
     grid, weights = unit_grid(), smooth_weights(SHAPE, bones)
     transforms = random_transforms(1, bones, angle)
     points, _ = posed_queries(weights, transforms[0], 40)
-    result = find_correspondences(points[None], transforms, weights, grid, search=SearchConfig(max_steps=20))
+    search = SearchConfig(max_steps=20, backend=backend)
+    result = find_correspondences(points[None], transforms, weights, grid, search=search)
     truth = exhaustive_roots(points, weights, transforms[0], grid)
-    hits = total = 0
+    total = 0
     for q, roots in enumerate(truth):
         mine = result.canonical[result.query == q]
         found, nothing_else = same_roots(mine, roots)
         assert nothing_else, f"query {q} has a root that is none"
-        assert len(mine) <= len(roots), f"query {q} has a root twice"
-        hits, total = hits + found, total + len(roots)
+        assert len(mine) == found == len(roots), f"query {q} lacks a root or has one twice"
+        total += len(roots)
     assert total >= 40  # every query was made from a canonical point
-    # One start in a cell: a second root in the same cell, where the determinant changes sign, may be missed.
-    assert hits >= 0.97 * total
 
 
 def test_complete_search_returns_the_point_it_came_from():
@@ -85,11 +85,11 @@ def test_broyden_roots_are_among_the_complete_ones():
         points[None], transforms, weights, grid, search=SearchConfig("broyden", tolerance=1e-6, max_steps=50)
     )
     known = [
-        bool(((complete.canonical[complete.query == query] - root).norm(dim=1) < 1e-4).any())
+        bool(((complete.canonical[complete.query == query] - root).norm(dim=1) < 2e-4).any())
         for root, query in zip(broyden.canonical, broyden.query, strict=True)
     ]
     assert len(known) > 250
-    assert sum(known) >= 0.98 * len(known)  # the rest are second roots in a fold's cell
+    assert all(known)  # beside a fold, a residual of 1e-6 m leaves Broyden's root 1e-4 m off
     few = find_correspondences(points[None], transforms, weights, grid, search=SearchConfig("broyden", init_bones=[0]))
     assert len(few.query) < len(broyden.query)
 

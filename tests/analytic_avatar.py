@@ -8,7 +8,7 @@ from torch import Tensor
 
 from snarfcli.avatar import Avatar
 from snarfcli.bodies import Skeleton
-from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
+from snarfcli.deformer import BodySkinningConfig, CanonicalGrid, SearchConfig
 from snarfcli.deformer.skinning import skin
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import System
@@ -46,7 +46,7 @@ class AnalyticAvatar(Avatar):
     """
 
     def __init__(self, skeleton: Skeleton, grid: CanonicalGrid, **facts: str) -> None:
-        config = AvatarConfig(ModelConfig(), SkinningConfig(), SearchConfig(), ShapeConfig())
+        config = AvatarConfig(ModelConfig(), BodySkinningConfig(), SearchConfig(), ShapeConfig())
         self.config, self.skeleton, self.facts, self.template = config, skeleton, dict(facts), None
         self.model = _NoNetwork(config, skeleton, grid)
         self._derived = {}

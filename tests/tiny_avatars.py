@@ -10,7 +10,7 @@ import torch
 
 from snarfcli.avatar import Avatar
 from snarfcli.bodies import MeshTemplate, Skeleton
-from snarfcli.deformer import CanonicalGrid, PresetWeights, SearchConfig, SkinningConfig
+from snarfcli.deformer import BodySkinningConfig, CanonicalGrid, PresetWeights, SearchConfig
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.shape import ConditionConfig, ShapeConfig
 
@@ -32,7 +32,7 @@ def tiny_avatar(kind: str = "fast_snarf") -> Avatar:
     system = kind if kind in ("snarf", "pose_onet", "back_lbs", "back_d", "nasa", "piecewise", "smpl_nn") else "fast_snarf"
     field = {"voxel": "voxel", "symmetric": "voxel", "preset": "preset", "mlp": "mlp"}.get(kind, "distilled")
     is_searched = "mlp" in (field, kind) or kind == "snarf"
-    skinning = SkinningConfig(
+    skinning = BodySkinningConfig(
         name=field, resolution=[5, 6, 4], width=6, depth=1, weight_norm=kind == "normed", prior_falloff_m=0.05,
         bone_radius_m=None, symmetric=kind == "symmetric", sharpness=5.0,
         softmax="hierarchical" if kind == "voxel" else "plain",

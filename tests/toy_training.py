@@ -8,7 +8,7 @@ from pathlib import Path
 from toy_subject import toy_subject
 
 from snarfcli.avatar import Avatar
-from snarfcli.deformer import CanonicalGrid, SearchConfig, SkinningConfig
+from snarfcli.deformer import BodySkinningConfig, CanonicalGrid, SearchConfig
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.samples.preprocessing import preprocess_subject
 from snarfcli.samples.store import SampleStore
@@ -27,7 +27,7 @@ def toy_store(root: Path, points: int = 800, frames: int = 34) -> SampleStore:
 
 def avatar_config(*, capsules: bool = False, condition: str = "global", **search: object) -> AvatarConfig:
     """Return networks that train in seconds; with `capsules` the initial shape is a capsule around the only bone."""
-    skinning = SkinningConfig(
+    skinning = BodySkinningConfig(
         resolution=[16, 12, 8], margin_m=[0.05, 0.05, 0.05], width=32, depth=2, weight_norm=False, prior_falloff_m=0.03
     )
     shape = ShapeConfig(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from snarfcli.checks import check_choice, check_number, check_positive
-from snarfcli.deformer import SearchConfig, SkinningConfig
+from snarfcli.deformer import BodySkinningConfig, SearchConfig
 from snarfcli.deformer.hierarchy import SOFTMAXES
 from snarfcli.deformer.search_config import BACKENDS, JACOBIANS, SEARCHES
 from snarfcli.deformer.skinning_config import FIELDS
@@ -30,7 +30,7 @@ def check_search(search: SearchConfig) -> None:
     check_positive("search.divergence", search.divergence)
 
 
-def check_skinning(skinning: SkinningConfig, search: SearchConfig) -> None:
+def check_skinning(skinning: BodySkinningConfig, search: SearchConfig) -> None:
     """Check the settings of the weight field, alone and together with the search.
 
     Raises:

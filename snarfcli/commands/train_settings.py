@@ -9,7 +9,7 @@ from omegaconf import MISSING
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.deformer_checks import check_search, check_skinning
 from snarfcli.datasets.settings import DataConfig
-from snarfcli.deformer import SearchConfig, SkinningConfig
+from snarfcli.deformer import BodySkinningConfig, SearchConfig
 from snarfcli.errors import UserError
 from snarfcli.models.settings import ModelConfig
 from snarfcli.models.trained_field import SYSTEMS
@@ -41,7 +41,7 @@ class TrainConfig:
     """Data set of the samples."""
     model: ModelConfig = MISSING
     """System of the papers."""
-    skinning: SkinningConfig = MISSING
+    skinning: BodySkinningConfig = MISSING
     """Field of skinning weights."""
     search: SearchConfig = MISSING
     """Correspondence search."""

@@ -12,18 +12,21 @@ from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.grid_search import find_correspondences
 from snarfcli.deformer.map_search import find_correspondences_on_map
+from snarfcli.deformer.posed import PosedDeformer
 from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, blended_matrices, inverse_skin, skin
-from snarfcli.deformer.skinning_config import SkinningConfig
+from snarfcli.deformer.skinning_config import BodySkinningConfig, SkinningConfig
 from snarfcli.deformer.weights import BonePrior, NodeWeights, WeightField
 
 __all__ = [
+    "BodySkinningConfig",
     "BonePrior",
     "CanonicalBody",
     "CanonicalGrid",
     "Correspondences",
     "ForwardDeformer",
     "NodeWeights",
+    "PosedDeformer",
     "PresetWeights",
     "SearchConfig",
     "SkinningConfig",

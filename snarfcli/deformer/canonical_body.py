@@ -17,12 +17,12 @@ from snarfcli.deformer.grid import CanonicalGrid, locate
 from snarfcli.deformer.grid_sides import with_grid_sides
 from snarfcli.deformer.hierarchy import PlainSoftmax
 from snarfcli.deformer.skinning import skin
-from snarfcli.deformer.skinning_config import SkinningConfig
+from snarfcli.deformer.skinning_config import BodySkinningConfig, SkinningConfig
 from snarfcli.deformer.weights import GridWeights, VoxelWeights
 
 __all__ = ["CanonicalBody", "canonical_body", "weights_around"]
 
-_ADULT_M = 1.75  # longest side of SMPL's body in the canonical pose, for which the margins of `SkinningConfig` are
+_ADULT_M = 1.75  # longest side of SMPL's body in the canonical pose, for which the margins of `BodySkinningConfig` are
 _LEAST_WEIGHT = 1e-5  # of trained weights: a weight of zero has no gradient. 24 bones 1 m away move a point by 0.2 mm
 
 
@@ -94,7 +94,7 @@ def _with_grid(
     size = float((vertices.amax(0) - vertices.amin(0)).max()) / _ADULT_M
     if not size > 0:
         raise ValueError("vertices: wanted a body, got vertices that are all in one place")
-    settings = SkinningConfig()
+    settings = BodySkinningConfig()
     assert settings.bone_radius_m is not None
     chosen = replace(settings, margin_m=[size * margin for margin in settings.margin_m])
     chosen = with_grid_sides(chosen, vertices, skeleton)

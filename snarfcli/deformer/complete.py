@@ -12,7 +12,7 @@ csrc/cpu/kernels.cpp) find the same roots.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -32,7 +32,7 @@ from snarfcli.deformer.cell_polynomials import (
 from snarfcli.deformer.grid import CORNERS, CanonicalGrid, cell_corners
 from snarfcli.deformer.roots import Roots, drop_duplicates
 
-__all__ = ["complete_roots", "posed_cell_boxes"]
+__all__ = ["complete_roots", "posed_boxes", "posed_cell_boxes"]
 
 _QUERIES_AT_ONCE = 65_536  # bounds the memory: a query has several candidate cells
 _CELLS_AT_ONCE = 65_536  # bounds the memory: 400 bytes of corner transforms per cell, and as much per intermediate result
@@ -176,6 +176,30 @@ def posed_cell_boxes(corner_transforms: Tensor, origins: Tensor, cell_size: Tens
     """
     lower, upper = _posed_boxes(cell_polynomials(corner_transforms, (origins + cell_size / 2).T, cell_size))
     return lower.T, upper.T
+
+
+def posed_boxes(transforms: Tensor, grid: CanonicalGrid, shape: Sequence[int], active_cells: Tensor | None = None) -> Tensor:
+    """Return the lower and upper corner of a box around the images of cells in each pose, [B, 2, 3], metres.
+
+    Args:
+        transforms: [B, D * H * W, 12], blended transforms at the nodes.
+        grid: the box of the nodes.
+        shape: nodes (D, H, W).
+        active_cells: [D-1, H-1, W-1], bool; None for all.
+    """
+    depth, height, width = shape
+    cells = (torch.ones(depth - 1, height - 1, width - 1) if active_cells is None else active_cells).reshape(-1)
+    corners = cell_corners(cells.nonzero()[:, 0].to(transforms.device), shape)
+    origins = grid.nodes(shape).reshape(-1, 3)[corners[:, 0]]
+    boxes = []
+    for one in transforms:
+        parts = [
+            posed_cell_boxes(one[some], places, grid.cell_size(shape))
+            for some, places in zip(corners.split(_CELLS_AT_ONCE), origins.split(_CELLS_AT_ONCE), strict=True)
+        ]
+        lower, upper = (torch.cat(sides) for sides in zip(*parts, strict=True))
+        boxes.append(torch.stack([lower.amin(0), upper.amax(0)]))
+    return torch.stack(boxes) if boxes else transforms.new_empty(0, 2, 3)
 
 
 def _cells_of(transforms: Tensor, numbers: Tensor, grid: CanonicalGrid, shape: tuple[int, int, int]) -> _Cells:

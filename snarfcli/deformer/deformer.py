@@ -2,39 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
+from typing import overload
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from snarfcli.deformer.canonical_body import CanonicalBody, canonical_body, weights_around
-from snarfcli.deformer.cells import corners_of
-from snarfcli.deformer.complete import posed_cell_boxes
+from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.correspondences import Correspondences
+from snarfcli.deformer.field_on_grid import FieldOnGrid
 from snarfcli.deformer.field_search import find_correspondences_on_field
-from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
-from snarfcli.deformer.grid_search import check_transforms, find_correspondences
+from snarfcli.deformer.forward_maps import ForwardMap, map_in_cells, map_on_field
+from snarfcli.deformer.grid import CanonicalGrid
+from snarfcli.deformer.grid_search import BlendedPoses, check_points, check_transforms, check_values, find_correspondences
 from snarfcli.deformer.hierarchy import make_softmax
-from snarfcli.deformer.search_config import SearchConfig, as_search_config
-from snarfcli.deformer.skinning import blend_transforms, interpolate, skin
+from snarfcli.deformer.posed import PosedDeformer, PosedField, PosedGrid
+from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
+from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.deformer.skinning_config import FIELDS, SkinningConfig
-from snarfcli.deformer.variation import total_variation
-from snarfcli.deformer.weights import (
-    BonePrior,
-    GridWeights,
-    NetworkWeights,
-    NodeWeights,
-    VoxelWeights,
-    WeightField,
-)
+from snarfcli.deformer.weights import BonePrior, NetworkWeights, NodeWeights, VoxelWeights, WeightField
 
 __all__ = ["ForwardDeformer"]
 
-_VALUES_AT_ONCE = 2**24  # of a layer, at the nodes; 65,536 nodes with layers of 256
 
-
-class ForwardDeformer(nn.Module):
+class ForwardDeformer(FieldOnGrid):
     """Find the canonical correspondences of posed points under learned forward skinning.
 
     Args:
@@ -46,22 +38,15 @@ class ForwardDeformer(nn.Module):
         prior: weights that the field only corrects.
         parents: parent of each bone, negative for a root; for skinning.softmax "hierarchical".
         field: a custom weight field instead of the one that `skinning` describes: a module or function from canonical
-            points [N, 3], metres, to weights [N, J], rows sum to 1. It is evaluated at the grid nodes, or searched directly if
-            skinning.name is "mlp". A module is trained, moved and saved with the deformer.
+            points [N, 3], metres, to weights [N, J], rows sum to 1. If it has a parameter named `pose_index`, it also gets the
+            pose of each point, [N], and the weights may differ from pose to pose. It is evaluated at the grid nodes, or
+            searched directly if skinning.name is "mlp". A module is trained, moved and saved with the deformer.
         mirror: the bone to which each is mapped by the symmetry of voxel weights, see `VoxelWeights`; None for none.
 
     Raises:
         ValueError: a setting does not exist, or does not fit the others.
     """
 
-    lower: Tensor
-    upper: Tensor
-    active_cells: Tensor
-    """[D-1, H-1, W-1], bool, the cells that a complete search looks into; see `set_active_cells`."""
-    _used_nodes: Tensor
-    _active_nodes: Tensor
-    _active_points: Tensor
-    field: Callable[[Tensor], Tensor]
     body: CanonicalBody | None = None
     """The body that the deformer was made for by `from_body`; not part of the state."""
 
@@ -75,31 +60,19 @@ class ForwardDeformer(nn.Module):
         prior: BonePrior | None = None,
         *,
         parents: Sequence[int] | None = None,
-        field: Callable[[Tensor], Tensor] | None = None,
+        field: Callable[..., Tensor] | None = None,
         mirror: Sequence[int] | None = None,
     ) -> None:
-        super().__init__()
         skinning = skinning or SkinningConfig()
         if skinning.name not in FIELDS:
             raise ValueError(f"skinning.name: wanted {', '.join(FIELDS[:-1])} or {FIELDS[-1]}, got {skinning.name!r}")
         width, height, depth = skinning.resolution
-        self.shape = (depth, height, width)
-        self.num_bones = num_bones
-        self.searches_field = skinning.name == "mlp"
-        """Whether roots are those of the field itself and not of its values at the grid nodes."""
-        self.search = as_search_config(search or ("broyden" if self.searches_field else None))
-        self.field = field if field is not None else _make_field(grid, self.shape, num_bones, skinning, prior, parents, mirror)
-        if isinstance(self.field, GridWeights) and self.field.shape != self.shape:
-            raise ValueError(f"field: wanted the grid's nodes {list(self.shape)} (z, y, x), got {list(self.field.shape)}")
-        self.register_buffer("lower", grid.lower.clone())
-        self.register_buffer("upper", grid.upper.clone())
-        self.register_buffer("active_cells", torch.ones([n - 1 for n in self.shape], dtype=torch.bool))
-        self.register_buffer("_used_nodes", torch.empty(0, dtype=torch.bool), persistent=False)
-        self.register_buffer("_active_nodes", torch.empty(0, dtype=torch.long), persistent=False)
-        self.register_buffer("_active_points", torch.empty(0, 3), persistent=False)
-        self.set_active_cells(self.active_cells if active_cells is None else active_cells)
-        self._frozen: Tensor | None = None
-        self.register_load_state_dict_post_hook(_after_load)
+        shape = (depth, height, width)
+        if field is None:
+            field = _make_field(grid, shape, num_bones, skinning, prior, parents, mirror)
+        searches_field = skinning.name == "mlp"
+        super().__init__(grid, shape, num_bones, field, searches_field, active_cells)
+        self.search = as_search_config(search or ("broyden" if searches_field else None))
 
     @classmethod
     def from_body(
@@ -126,7 +99,7 @@ class ForwardDeformer(nn.Module):
             canonical_pose: [J, 3], axis-angle relative to the body's rest pose, radians; None: the rest pose, with the legs 30
                 degrees outwards if the joints are SMPL's or named l_hip and r_hip.
             resolution: grid nodes along x, y, z; None for as many as in `SkinningConfig`, distributed by the sides of the box.
-            margin_m: margin of the box along x, y, z, metres; None for those of `SkinningConfig` in proportion to the body.
+            margin_m: margin of the box along x, y, z, metres; None: `BodySkinningConfig`, in proportion to the body.
             search: as for the class.
             trainable: whether the weights are trained, from those of the body on, as voxel weights.
 
@@ -154,101 +127,36 @@ class ForwardDeformer(nn.Module):
             )
         self._search = search
 
-    @property
-    def grid(self) -> CanonicalGrid:
-        """The box of the weight grid."""
-        return CanonicalGrid(self.lower, self.upper, checked=True)
-
-    # ---------------------------------------------------------------- weights
-    def weight_grid(self, active_only: bool = False) -> Tensor:
-        """Return the skinning weights at the grid nodes, [D, H, W, J].
-
-        With `active_only` only the nodes of active cells are evaluated, which are all that a complete search reads; the others
-        are zero. Nothing in it waits for a GPU.
-        """
-        if self._frozen is not None:
-            return self._frozen
-        if not active_only:
-            return self._weights_of_nodes(None).reshape(*self.shape, -1)
-        used = self._active_nodes
-        weights = self._weights_of_nodes(used)
-        return weights.new_zeros(math.prod(self.shape), self.num_bones).index_copy(0, used, weights).reshape(*self.shape, -1)
-
-    def _weights_of_nodes(self, nodes: Tensor | None) -> Tensor:
-        """Return the weights [K, J] at the active nodes, given as `nodes`, or at all nodes if None."""
-        count = math.prod(self.shape) if nodes is None else len(nodes)
-        if isinstance(self.field, GridWeights):
-            return self._checked(self.field.at_nodes(nodes), count)
-        points = self.grid.nodes(self.shape).reshape(-1, 3) if nodes is None else self._active_points
-        # not a subclass, whose `forward` may be another one
-        if type(self.field) is not NetworkWeights:
-            return self._checked(self.field(points), count)
-        most = count if torch.is_grad_enabled() else max(1, _VALUES_AT_ONCE // self.field.most_values)
-        if count <= most:
-            return self._checked(self.field.at_fixed_points(points), count)
-        return self._checked(torch.cat([self.field.at_fixed_points(part) for part in points.split(most)]), count)
-
-    def node_weights(self, active_only: bool | None = None) -> NodeWeights | None:
+    def node_weights(self, active_only: bool | None = None, poses: int | None = None) -> NodeWeights | None:
         """Evaluate the skinning weights at the nodes that a search reads; None for a field that is searched directly.
 
         A search and `skinning_weights` take the result, so that the field is evaluated once for both.
 
         Args:
             active_only: whether only nodes of active cells are evaluated; None: as the search needs it.
+            poses: B, for a field with a parameter `pose_index`; otherwise of no effect.
         """
-        if self.searches_field:
-            return None
-        return self._node_weights(self.search.name == "complete" if active_only is None else active_only)
-
-    def _node_weights(self, active_only: bool) -> NodeWeights:
-        with torch.autocast(self.lower.device.type, enabled=False):
-            return NodeWeights(self.weight_grid(active_only), self.grid)
-
-    def skinning_weights(self, canonical: Tensor, weights: NodeWeights | None = None) -> Tensor:
-        """Return the skinning weights [N, J] at canonical points [N, 3], as the search uses them.
-
-        Args:
-            canonical: [N, 3], metres.
-            weights: from `node_weights`, if they have been evaluated already; the points must then lie in active cells.
-        """
-        if self.searches_field:
-            return self._checked(self.field(canonical), len(canonical))
-        return interpolate(self.weight_grid() if weights is None else weights.values, canonical, self.grid)
-
-    def _checked(self, weights: Tensor, count: int) -> Tensor:
-        """Return the weights of a field, or raise ValueError if their shape is wrong."""
-        if tuple(weights.shape) != (count, self.num_bones):
-            raise ValueError(f"field: wanted weights of shape [{count}, {self.num_bones}], got {list(weights.shape)}")
-        return weights
-
-    def freeze(self) -> ForwardDeformer:
-        """Evaluate the weight grid once and keep it; for use after training. `train()` discards it."""
-        self.eval()
-        self._frozen = None
-        with torch.no_grad():
-            self._frozen = self.weight_grid()
-        return self
-
-    def train(self, mode: bool = True) -> ForwardDeformer:
-        """Switch between training and evaluation; both discard a frozen weight grid."""
-        self._frozen = None
-        return super().train(mode)
-
-    def _apply(self, fn, recurse=True):
-        self._frozen = None
-        return super()._apply(fn, recurse)
+        return super().node_weights(self.search.name == "complete" if active_only is None else active_only, poses)
 
     # ---------------------------------------------------------------- search
     def forward(
-        self, points: Tensor, bone_transforms: Tensor, capacity: int | None = None, weights: NodeWeights | None = None
+        self,
+        points: Tensor,
+        bone_transforms: Tensor,
+        capacity: int | None = None,
+        weights: NodeWeights | None = None,
+        starts: Tensor | None = None,
     ) -> Correspondences:
         """Find the correspondences of posed points, in full precision, also under autocast.
+
+        For many calls in the same poses see `pose`.
 
         Args:
             points: [B, N, 3], posed space, metres.
             bone_transforms: [B, J, 4, 4], canonical to posed.
             capacity: as in `find_correspondences`; not for a field that is searched directly.
             weights: from `node_weights`, if they have been evaluated already.
+            starts: [B, N, I, 3], canonical points from which a broyden search starts, metres; None for the start bones.
         """
         with torch.autocast(points.device.type, enabled=False):
             if self.searches_field:
@@ -256,11 +164,12 @@ class ForwardDeformer(nn.Module):
                     raise ValueError(
                         "capacity: wanted None for a field that is searched directly; it needs a search on the grid"
                     )
-                return find_correspondences_on_field(points, bone_transforms, self.field, self.grid, search=self.search)
-            complete = self.search.name == "complete"
-            weights = self._node_weights(active_only=complete) if weights is None else weights
-            sums_to_one = isinstance(self.field, WeightField)
-            if sums_to_one:
+                return find_correspondences_on_field(
+                    points, bone_transforms, self.field, self.grid, starts=starts, search=self.search
+                )
+            if weights is None:
+                weights = self._searched_weights(len(bone_transforms))
+            if self._sums_to_one:
                 check_transforms(bone_transforms)
             return find_correspondences(
                 points,
@@ -268,38 +177,144 @@ class ForwardDeformer(nn.Module):
                 weights.values,
                 self.grid,
                 search=self.search,
-                active_cells=self.active_cells if complete else None,
+                starts=starts,
+                active_cells=self._searched_cells,
                 capacity=capacity,
-                check=not sums_to_one,
+                check=not self._sums_to_one,
             )
 
-    def set_active_cells(self, cells: Tensor) -> None:
-        """Choose the cells that a complete search looks into, [D-1, H-1, W-1], bool; they are saved with the state.
+    def pose(self, bone_transforms: Tensor, weights: NodeWeights | None = None) -> PosedDeformer:
+        """Prepare poses for many calls: the transforms are blended, and the cells sorted, once.
 
-        Waits for a GPU, so that a search need not.
+        `posed = deformer.pose(transforms)`, then `posed(points)` returns what `deformer(points, transforms)` does. On a CPU a
+        million points in 200 calls take about as long as in one.
+
+        Args:
+            bone_transforms: [B, J, 4, 4], canonical to posed, metres, of the dtype and on the device of the deformer.
+            weights: from `node_weights`, if they have been evaluated already.
 
         Raises:
-            ValueError: the shape or dtype differs, or no cell is left.
+            ValueError, TypeError: as `find_correspondences`.
         """
-        wanted = [n - 1 for n in self.shape]
-        if list(cells.shape) != wanted or cells.dtype != torch.bool:
-            raise ValueError(f"active_cells: wanted bool {wanted}, got {cells.dtype} {list(cells.shape)}")
-        if not bool(cells.any()):
-            raise ValueError("active_cells: wanted at least one cell, got none")
-        self.active_cells.copy_(cells)
-        self._update_active_nodes()
+        self._check_poses(bone_transforms)
+        check_search_config(self.search, self.num_bones)
+        with torch.autocast(bone_transforms.device.type, enabled=False):
+            check_transforms(bone_transforms)
+            if self.searches_field:
+                return PosedField(
+                    bone_transforms, self.field, self.grid, self.search, lambda: self._box_of_nodes(bone_transforms)
+                )
+            if weights is None:
+                weights = self._searched_weights(len(bone_transforms))
+            cells = self._searched_cells
+            if not self._sums_to_one:
+                check_values(self.grid, bone_transforms, weights.values, cells)
+            poses = BlendedPoses.of(bone_transforms, weights.values, self.grid, self.search, cells)
+            if cells is None or bool(cells.all()):
+                return PosedGrid(bone_transforms, poses, lambda: poses)
+            return PosedGrid(bone_transforms, poses, lambda: self._blended_everywhere(bone_transforms))
 
-    def _update_active_nodes(self) -> None:
-        """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
-        self._used_nodes = corners_of(self.active_cells)
-        self._active_nodes = self._used_nodes.reshape(-1).nonzero()[:, 0]
-        self._active_points = self.grid.nodes(self.shape).reshape(-1, 3)[self._active_nodes]
+    def _blended_everywhere(self, bone_transforms: Tensor) -> BlendedPoses:
+        weights = self.weight_grid(poses=len(bone_transforms))
+        return BlendedPoses.of(bone_transforms, weights, self.grid, self.search, None)
 
-    def is_active(self, canonical: Tensor) -> Tensor:
-        """Return whether canonical points [N, 3] lie in cells that a complete search looks into, [N], bool."""
-        cell, local = locate(canonical, self.grid, self.shape)
-        return ((local >= 0) & (local <= 1)).all(1) & self.active_cells.reshape(-1)[cell]
+    def _searched_weights(self, poses: int) -> NodeWeights:
+        weights = self.node_weights(poses=poses)
+        assert weights is not None
+        return weights
 
+    @property
+    def _searched_cells(self) -> Tensor | None:
+        return self.active_cells if self.search.name == "complete" else None
+
+    @property
+    def _sums_to_one(self) -> bool:
+        """Whether the weights are known to sum to 1, so that this need not be checked."""
+        return isinstance(self.field, WeightField)
+
+    # ---------------------------------------------------------------- forward skinning
+    @overload
+    def skin(self, canonical: Tensor, bone_transforms: Tensor, *, directions: None = None, normals: None = None) -> Tensor: ...
+
+    @overload
+    def skin(
+        self, canonical: Tensor, bone_transforms: Tensor, *, directions: Tensor | None = None, normals: Tensor | None = None
+    ) -> Tensor | tuple[Tensor, ...]: ...
+
+    def skin(
+        self, canonical: Tensor, bone_transforms: Tensor, *, directions: Tensor | None = None, normals: Tensor | None = None
+    ) -> Tensor | tuple[Tensor, ...]:
+        """Move canonical points into poses: the inverse of the search, differentiable and exact also under autocast.
+
+        Args:
+            canonical: [B, N, 3], metres; or [N, 3] for one pose.
+            bone_transforms: [B, J, 4, 4], canonical to posed, metres; or [J, 4, 4].
+            directions: of the shape of `canonical`, a vector at each point, such as a tangent; moved by the exact Jacobian of
+                the deformation, which contains the derivative of the weights.
+            normals: of the shape of `canonical`, a normal at each point; moved by the inverse transpose of the Jacobian and
+                normalised.
+
+        Returns:
+            Posed points, of the shape of `canonical`, metres; with `directions` or `normals` a tuple of the points and of
+            these, in this order.
+
+        Raises:
+            ValueError, TypeError: a shape, dtype or device does not fit.
+
+        Source: SNARF Eq. 4.
+        """
+        for name, vectors in (("directions", directions), ("normals", normals)):
+            if vectors is not None and vectors.shape != canonical.shape:
+                raise ValueError(f"{name}: wanted the shape of the points, {list(canonical.shape)}, got {list(vectors.shape)}")
+        is_one = canonical.ndim == 2 and bone_transforms.ndim == 3
+        if is_one:
+            canonical, bone_transforms = canonical[None], bone_transforms[None]
+            directions, normals = (None if vectors is None else vectors[None] for vectors in (directions, normals))
+        with_jacobian = directions is not None or normals is not None
+        results = self._forward_map(canonical, bone_transforms, with_jacobian).skinned(directions, normals)
+        if not is_one:
+            return results
+        return results[0] if isinstance(results, Tensor) else tuple(result[0] for result in results)
+
+    def transforms_at(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
+        """Return the blended transforms [B, N, 4, 4] at canonical points [B, N, 3], metres; differentiable.
+
+        Args:
+            canonical: [B, N, 3], metres.
+            bone_transforms: [B, J, 4, 4], canonical to posed, metres.
+        """
+        return self._forward_map(canonical, bone_transforms, with_jacobian=False).matrices()
+
+    def _forward_map(self, canonical: Tensor, bone_transforms: Tensor, with_jacobian: bool) -> ForwardMap:
+        self._check_poses(bone_transforms)
+        canonical = canonical.to(bone_transforms.dtype)
+        check_points(canonical, bone_transforms, "canonical")
+        batch, count = canonical.shape[:2]
+        with torch.autocast(canonical.device.type, enabled=False):
+            if self.searches_field:
+                return map_on_field(self.field, canonical, bone_transforms, with_jacobian)
+            pose = torch.arange(batch, device=canonical.device).repeat_interleave(count)
+            corners, local = self.corner_weights(canonical.reshape(-1, 3), pose)
+            transforms = blend_transforms(corners.reshape(batch, 1, count, 8, -1), bone_transforms)
+            transforms = transforms.reshape(batch, count, 8, 12)
+            size = self.grid.cell_size(self.shape)
+            return map_in_cells(transforms, local.reshape(batch, count, 3), canonical, size, with_jacobian)
+
+    def _check_poses(self, bone_transforms: Tensor) -> None:
+        """Raise ValueError or TypeError for transforms that are not [B, J, 4, 4] or do not fit the deformer."""
+        shape = list(bone_transforms.shape)
+        if len(shape) != 4 or shape[1:] != [self.num_bones, 4, 4]:
+            raise ValueError(f"bone_transforms: wanted shape [B, {self.num_bones}, 4, 4], got {shape}")
+        if bone_transforms.dtype != self.lower.dtype:
+            raise TypeError(
+                f"bone_transforms: wanted the dtype of the deformer, {self.lower.dtype}, got {bone_transforms.dtype}"
+            )
+        if bone_transforms.device != self.lower.device:
+            raise ValueError(
+                f"bone_transforms: wanted the device of the deformer, {self.lower.device}, got {bone_transforms.device}"
+            )
+
+    # ---------------------------------------------------------------- boxes
     def posed_box(self, bone_transforms: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
         """Return the corners (lower [3], upper [3]) of a box around the images of `cells` in one pose, metres.
 
@@ -309,31 +324,14 @@ class ForwardDeformer(nn.Module):
             bone_transforms: [J, 4, 4], canonical to posed.
             cells: [D-1, H-1, W-1], bool, at least one.
         """
-        corners = cell_corners(cells.reshape(-1).nonzero()[:, 0], self.shape)
-        origins = self.grid.nodes(self.shape).reshape(-1, 3)[corners[:, 0]]
-        transforms = blend_transforms(self.weight_grid(), bone_transforms[None])[0][corners]
-        lower, upper = posed_cell_boxes(transforms, origins, self.grid.cell_size(self.shape))
-        return lower.amin(0).cpu(), upper.amax(0).cpu()
+        lower, upper = self._box_of_nodes(bone_transforms[None], cells)
+        return lower[0].cpu(), upper[0].cpu()
 
-    def random_canonical(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return canonical points [count, 3] spread evenly over the active cells, metres."""
-        cells = self.active_cells.nonzero()
-        chosen = torch.randint(len(cells), (count,), generator=generator).to(cells.device)
-        places = torch.rand(count, 3, generator=generator).to(self.lower)
-        return self.lower + (cells[chosen].flip(1) + places) * self.grid.cell_size(self.shape)
-
-    def skin(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
-        """Move canonical points [N, 3] into one pose [J, 4, 4]; the inverse of the search."""
-        return skin(canonical, self.skinning_weights(canonical), bone_transforms)
-
-    def smoothness(self, weights: NodeWeights | None = None) -> Tensor:
-        """Return the total variation of the weights over the nodes of active cells (see `total_variation`).
-
-        Args:
-            weights: from `node_weights`, if they have been evaluated already.
-        """
-        values = self.weight_grid(active_only=True) if weights is None else weights.values
-        return total_variation(values, self.grid, self._used_nodes)
+    def _box_of_nodes(self, bone_transforms: Tensor, cells: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the corners, [B, 3] each, of boxes around the images of `cells`, or of the active cells if None."""
+        transforms = blend_transforms(self.weight_grid(poses=len(bone_transforms)), bone_transforms)
+        boxes = posed_boxes(transforms, self.grid, self.shape, self.active_cells if cells is None else cells)
+        return boxes[:, 0], boxes[:, 1]
 
 
 def _make_field(
@@ -352,13 +350,3 @@ def _make_field(
     if skinning.name == "voxel":
         return VoxelWeights(softmax, grid, shape, skinning.sharpness, prior, mirror)
     return NetworkWeights(softmax, grid, skinning.width, skinning.depth, skinning.sharpness, skinning.weight_norm, prior)
-
-
-def _after_load(deformer: ForwardDeformer, incompatible: object) -> None:
-    """Update what follows from the state after load_state_dict: the field's box and the nodes of active cells."""
-    deformer._frozen = None
-    if not bool(deformer.active_cells.any()):
-        raise ValueError("active_cells: wanted at least one cell, got none")
-    deformer._update_active_nodes()
-    if isinstance(deformer.field, WeightField):
-        deformer.field.set_box(deformer.grid)

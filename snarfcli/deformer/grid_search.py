@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from snarfcli.deformer.cells import corners_of
-from snarfcli.deformer.centring import centre
+from snarfcli.deformer.centring import Centred, centre
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.ops import broyden_search, complete_search
@@ -15,7 +17,7 @@ from snarfcli.deformer.search_config import SearchConfig, as_search_config, chec
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.deformer.starts import check_starts, start_transforms
 
-__all__ = ["check_transforms", "find_correspondences"]
+__all__ = ["BlendedPoses", "check_capacity", "check_points", "check_transforms", "check_values", "find_correspondences"]
 
 
 def find_correspondences(
@@ -64,25 +66,66 @@ def find_correspondences(
     check_starts(starts, points, search)
     if search.name == "broyden" and active_cells is not None:
         raise ValueError("active_cells needs search.name 'complete': a broyden search has no cells")
-    if capacity is not None and capacity < 0:
-        raise ValueError(f"capacity: wanted 0 or more, got {capacity}")
+    check_capacity(capacity)
     grid = grid.to(points)
     if check:
-        _check_values(grid, bone_transforms, skinning_weights, active_cells)
-    centred = centre(bone_transforms, grid)
-    near = centred.points(points)
-    transforms = blend_transforms(skinning_weights, centred.transforms, active_cells, search.backend)
-    box = (centred.grid.lower, centred.grid.upper, list(skinning_weights.shape[-4:-1]))
-    common = (search.orientation_preserving, capacity, search.backend)
-    if search.name == "complete":
-        found = complete_search(near, transforms, *box, active_cells, search.tolerance, search.max_steps, *common)
-    else:
-        given = start_transforms(centred.transforms, search.init_bones) if starts is None else centred.starts(starts)
+        check_values(grid, bone_transforms, skinning_weights, active_cells)
+    poses = BlendedPoses.of(bone_transforms, skinning_weights, grid, search, active_cells)
+    return poses.correspondences(points, poses.find(poses.centred.points(points), starts, capacity))
+
+
+@dataclass(frozen=True, eq=False)
+class BlendedPoses:
+    """B poses whose bone transforms are blended at the grid nodes, and how they are searched."""
+
+    transforms: Tensor
+    """[B, D * H * W, 12], upper rows of the blended transforms, in the moved frames of `centred`; differentiable."""
+    centred: Centred
+    """The poses and the grid near the origin."""
+    shape: list[int]
+    """Nodes (D, H, W)."""
+    search: SearchConfig
+    """Settings of the search."""
+    active_cells: Tensor | None
+    """[D-1, H-1, W-1], bool, the cells in which a complete search looks for roots; None for all."""
+
+    @classmethod
+    def of(
+        cls,
+        bone_transforms: Tensor,
+        skinning_weights: Tensor,
+        grid: CanonicalGrid,
+        search: SearchConfig,
+        active_cells: Tensor | None,
+    ) -> BlendedPoses:
+        """Blend arguments that have been checked; see `find_correspondences`."""
+        centred = centre(bone_transforms, grid)
+        transforms = blend_transforms(skinning_weights, centred.transforms, active_cells, search.backend)
+        return cls(transforms, centred, list(skinning_weights.shape[-4:-1]), search, active_cells)
+
+    @property
+    def box(self) -> tuple[Tensor, Tensor, list[int]]:
+        """Corners of the moved grid, [3] each, metres, and the nodes (D, H, W), as the operators take them."""
+        return self.centred.grid.lower, self.centred.grid.upper, self.shape
+
+    def find(self, near: Tensor, starts: Tensor | None, capacity: int | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Search for points [B, N, 3] in the moved frames; returns what the operators return (see `ops`)."""
+        search = self.search
+        common = (search.orientation_preserving, capacity, search.backend)
+        if search.name == "complete":
+            limits = (search.tolerance, search.max_steps)
+            return complete_search(near, self.transforms, *self.box, self.active_cells, *limits, *common)
+        bones = self.centred.transforms
+        given = start_transforms(bones, search.init_bones) if starts is None else self.centred.starts(starts)
         limits = (search.tolerance, search.divergence, search.max_steps)
-        found = broyden_search(near, transforms, given.detach(), *box, *limits, search.jacobian == "exact", *common)
-    canonical, query, jacobian_inverse, total = found
-    canonical = centred.restored(canonical, query < points.shape[0] * points.shape[1])
-    return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
+        exact = search.jacobian == "exact"
+        return broyden_search(near, self.transforms, given.detach(), *self.box, *limits, exact, *common)
+
+    def correspondences(self, points: Tensor, found: tuple[Tensor, Tensor, Tensor, Tensor]) -> Correspondences:
+        """Return what a search for points [B, N, 3] has found, in the given canonical frame."""
+        canonical, query, jacobian_inverse, total = found
+        canonical = self.centred.restored(canonical, query < points.shape[0] * points.shape[1])
+        return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
 
 
 @torch.no_grad()
@@ -103,7 +146,7 @@ def check_transforms(bone_transforms: Tensor) -> None:
         raise ValueError(f"bone_transforms: wanted invertible ones, got a singular one for bone {bone} of pose {pose}")
 
 
-def _check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
+def check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
     """Raise ValueError if grid, transforms or weights are invalid. Skipped on a GPU, as in `check_transforms`."""
     if is_costly_to_read(bone_transforms):
         return
@@ -120,10 +163,29 @@ def _check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights
             raise ValueError(f"skinning_weights: wanted a sum of 1 at every node of a searched cell, got {came:.4g}")
 
 
+def check_points(points: Tensor, poses: Tensor | None = None, name: str = "points") -> None:
+    """Raise ValueError or TypeError if points are not [B, N, 3], or do not fit the transforms [B, J, 4, 4] of poses."""
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise ValueError(f"{name}: wanted shape [B, N, 3], got {list(points.shape)}")
+    if poses is None:
+        return
+    if len(points) != len(poses):
+        raise ValueError(f"{name}: wanted shape [{len(poses)}, N, 3] to fit the poses, got {list(points.shape)}")
+    if points.dtype != poses.dtype:
+        raise TypeError(f"{name}: wanted the dtype of the poses, {poses.dtype}, got {points.dtype}")
+    if points.device != poses.device:
+        raise ValueError(f"{name}: wanted the device of the poses, {poses.device}, got {points.device}")
+
+
+def check_capacity(capacity: int | None) -> None:
+    """Raise ValueError for a negative capacity."""
+    if capacity is not None and capacity < 0:
+        raise ValueError(f"capacity: wanted 0 or more, got {capacity}")
+
+
 def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
     """Raise ValueError or TypeError if the tensors do not fit together."""
-    if points.ndim != 3 or points.shape[2] != 3:
-        raise ValueError(f"points: wanted shape [B, N, 3], got {list(points.shape)}")
+    check_points(points)
     batch, shape = points.shape[0], list(skinning_weights.shape)
     if len(shape) not in (4, 5) or min(shape[-4:-1]) < 2 or shape[-1] < 1:
         raise ValueError(f"skinning_weights: wanted shape [D, H, W, J], at least 2 nodes per side, got {shape}")

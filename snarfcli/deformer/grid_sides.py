@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton
-from snarfcli.deformer.skinning_config import SkinningConfig
+from snarfcli.deformer.skinning_config import BodySkinningConfig
 
 __all__ = ["with_grid_sides"]
 
 _FEWEST_NODES = 4
 
 
-def with_grid_sides(skinning: SkinningConfig, surface: Tensor, skeleton: Skeleton) -> SkinningConfig:
+def with_grid_sides(skinning: BodySkinningConfig, surface: Tensor, skeleton: Skeleton) -> BodySkinningConfig:
     """Adapt the settings of the grid to the proportions of a subject.
 
     The settings are for SMPL's bodies, which are wide, high and flat (64 x 64 x 16 nodes). For any other skeleton the longest

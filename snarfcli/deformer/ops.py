@@ -24,6 +24,7 @@ from snarfcli.native.backend import choose_backend
 from snarfcli.native.capacity import fit_to_capacity
 
 __all__ = [
+    "add_implicit_gradient",
     "broyden_search",
     "broyden_search_reference",
     "complete_search",
@@ -197,8 +198,9 @@ def implicit_backward_reference(
     count: int,
     wants_points: bool,
     wants_transforms: bool,
+    into: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """The readable version of `implicit_backward`.
+    """The readable version of `implicit_backward`; with `into` the gradient by the transforms is added to that tensor.
 
     With g the gradient by x*, implicit differentiation gives v = J^-T g for the query, and -v outer [x*; 1], weighted
     trilinearly, for each of the eight nodes of the root's cell.
@@ -217,9 +219,37 @@ def implicit_backward_reference(
         homogeneous = torch.cat([canonical, torch.ones_like(canonical[:, :1])], 1)
         v_blended = -(v[:, :, None] * homogeneous[:, None]).reshape(-1, 12)
         v_corners = trilinear_weights(local)[..., None] * v_blended[:, None]
-        v_transforms = gradient.new_zeros(batch * per_pose, 12).index_add(0, at.reshape(-1), v_corners.reshape(-1, 12))
-        v_transforms = v_transforms.reshape(batch, per_pose, 12)
+        v_transforms = gradient.new_zeros(batch, per_pose, 12) if into is None else into
+        v_transforms.view(-1, 12).index_add_(0, at.reshape(-1), v_corners.reshape(-1, 12))
     return v_points, v_transforms
+
+
+def add_implicit_gradient(
+    into: Tensor | None,
+    gradient: Tensor,
+    canonical: Tensor,
+    query: Tensor,
+    jacobian_inverse: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    shape: Sequence[int],
+    batch: int,
+    count: int,
+    wants_points: bool,
+    backend: str,
+) -> Tensor:
+    """Add the gradient of a loss by the transforms to `into` [B, D * H * W, 12], unless that is None.
+
+    Otherwise as `implicit_backward`.
+
+    Returns:
+        The gradient by the queries, [B, N, 3]; empty if not wanted.
+    """
+    device = gradient.device.type
+    native = {"cpu": cpu.implicit_backward, "cuda": cuda.implicit_backward}.get(device, implicit_backward_reference)
+    run = native if choose_backend(backend, device) == "native" else implicit_backward_reference
+    roots = (gradient, canonical, query, jacobian_inverse)
+    return run(*roots, lower, upper, shape, batch, count, wants_points, into is not None, into)[0]
 
 
 # ---------------------------------------------------------------- native kernels

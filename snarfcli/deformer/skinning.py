@@ -13,7 +13,15 @@ from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinea
 from snarfcli.networks import MAX_FEATURES, run_encoding
 from snarfcli.precision import matmul_precision
 
-__all__ = ["blend_transforms", "blended_matrices", "forward_jacobian", "interpolate", "inverse_skin", "skin"]
+__all__ = [
+    "blend_transforms",
+    "blended_matrices",
+    "forward_jacobian",
+    "interpolate",
+    "inverse_skin",
+    "skin",
+    "trilinear_transforms",
+]
 
 _INSIDE = 5e-5  # share of a cell; float32 places points in a grid of 64 cells to 2e-5
 _TINY = 1e-30  # length of a moved normal that counts as zero; those of transforms with small scales are short
@@ -69,14 +77,24 @@ def skin(
     _check(weights, bone_transforms, canonical=canonical, directions=directions, normals=normals)
     with torch.autocast(canonical.device.type, enabled=False):
         blended = _blend_rows(weights, bone_transforms, 3)
-        results = [_turn(blended, canonical) + blended[..., 3]]
-        if directions is not None:
-            results.append(_turn(blended, directions))
-        if normals is not None:
-            cofactors, determinant = _cofactors(blended)
-            turned = torch.stack([(row * normals).sum(-1) for row in cofactors], -1)
-            results.append(F.normalize(torch.where(determinant < 0, -turned, turned), dim=-1, eps=_TINY))
-    return results[0] if len(results) == 1 else tuple(results)
+        posed = _turn(blended, canonical) + blended[..., 3]
+        vectors = moved_vectors(blended, directions, normals)
+    return (posed, *vectors) if vectors else posed
+
+
+def moved_vectors(jacobian: Tensor, directions: Tensor | None, normals: Tensor | None) -> list[Tensor]:
+    """Return those of `directions` and `normals` [..., 3] that are given, moved by the 3x3 of `jacobian` [..., 3, 3 or 4].
+
+    Directions are multiplied by it, normals by its inverse transpose and normalised.
+    """
+    results = []
+    if directions is not None:
+        results.append(_turn(jacobian, directions))
+    if normals is not None:
+        cofactors, determinant = _cofactors(jacobian)
+        turned = torch.stack([(row * normals).sum(-1) for row in cofactors], -1)
+        results.append(F.normalize(torch.where(determinant < 0, -turned, turned), dim=-1, eps=_TINY))
+    return results
 
 
 def inverse_skin(posed: Tensor, weights: Tensor, bone_transforms: Tensor, least_determinant: float = 0.0) -> Tensor:
@@ -251,6 +269,24 @@ def forward_jacobian(corner_transforms: Tensor, local: Tensor, origin: Tensor, c
 
     Source: SNARF Eq. 4 with T(x) trilinear (Fast-SNARF Sec. 4.1); product rule for the Jacobian.
     """
+    stacked = torch.stack(trilinear_transforms(corner_transforms, local), 1).reshape(-1, 12, 4)
+    canonical = torch.addcmul(origin, local, cell_size)
+    homogeneous = torch.cat([canonical, torch.ones_like(canonical[:, :1])], 1)
+    moved = torch.bmm(stacked, homogeneous[:, :, None]).reshape(-1, 4, 3)  # T x, then dT/du_i x
+    jacobian = moved[:, 1:].transpose(1, 2) + stacked[:, :3, :3] * cell_size
+    return moved[:, 0], jacobian
+
+
+def trilinear_transforms(corner_transforms: Tensor, local: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Interpolate the transforms at the corners of grid cells.
+
+    Args:
+        corner_transforms: [M, 8, C], blended transforms at the corners of each point's cell.
+        local: [M, 3], coordinates in the cell, 0 to 1 inside.
+
+    Returns:
+        The transforms [M, C], and their derivatives by the three cell coordinates, [M, C] each.
+    """
     # Interpolate along z, then y, then x, and carry the differences along: several times faster than products with
     # the trilinear weights and their derivatives.
     u, v, w = (coordinate[:, None, None] for coordinate in local.unbind(1))
@@ -263,9 +299,4 @@ def forward_jacobian(corner_transforms: Tensor, local: Tensor, origin: Tensor, c
     u = u[:, 0]
     blended = torch.addcmul(at_v[:, 0], by_u, u)
     by_v, by_w = torch.lerp(by_v[:, 0], by_v[:, 1], u), torch.lerp(by_w[:, 0], by_w[:, 1], u)
-    canonical = torch.addcmul(origin, local, cell_size)
-    homogeneous = torch.cat([canonical, torch.ones_like(canonical[:, :1])], 1)
-    stacked = torch.stack([blended, by_u, by_v, by_w], 1).reshape(-1, 12, 4)
-    moved = torch.bmm(stacked, homogeneous[:, :, None]).reshape(-1, 4, 3)  # T x, then dT/du_i x
-    jacobian = moved[:, 1:].transpose(1, 2) + blended.reshape(-1, 3, 4)[:, :, :3] * cell_size
-    return moved[:, 0], jacobian
+    return blended, by_u, by_v, by_w

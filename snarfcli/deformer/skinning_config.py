@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from snarfcli.field_docs import documented
 
-__all__ = ["FIELDS", "SkinningConfig"]
+__all__ = ["FIELDS", "BodySkinningConfig", "SkinningConfig"]
 
 FIELDS = ("distilled", "voxel", "mlp", "preset")
 """Names of the weight fields."""
@@ -15,7 +15,7 @@ FIELDS = ("distilled", "voxel", "mlp", "preset")
 @documented
 @dataclass
 class SkinningConfig:
-    """Settings of the skinning weights and of the grid that they are evaluated on."""
+    """Settings of a weight field."""
 
     name: str = "distilled"
     """Weight field: distilled (a network evaluated at the grid nodes), voxel (optimised at the nodes), mlp (a network that is
@@ -24,12 +24,6 @@ class SkinningConfig:
     """How logits become weights: plain, or hierarchical down the tree of joints; no effect on preset weights."""
     resolution: list[int] = field(default_factory=lambda: [64, 64, 16])
     """Grid nodes along x, y, z. For a skeleton other than SMPL's the same total is distributed by the sides of its box."""
-    margin_m: list[float] = field(default_factory=lambda: [0.12, 0.12, 0.20])
-    """Margin of the grid's box around the canonical body on either side, along x, y, z, metres."""
-    bone_radius_m: float | None = 0.22
-    """Cells with a corner at most this far from a bone are searched at first, metres; null always searches every cell."""
-    surface_radius_m: float = 0.12
-    """Cells at most this far from the rough points of the body that give the grid's box are searched too, metres."""
     width: int = 128
     """Width of the network's hidden layers."""
     depth: int = 4
@@ -38,6 +32,19 @@ class SkinningConfig:
     """Factor before the softmax over the bones."""
     weight_norm: bool = True
     """Whether the network's layers are weight-normalised."""
+
+
+@documented
+@dataclass
+class BodySkinningConfig(SkinningConfig):
+    """Settings of the weight field of a body: also how its grid is laid around the body, and how it is trained."""
+
+    margin_m: list[float] = field(default_factory=lambda: [0.12, 0.12, 0.20])
+    """Margin of the grid's box around the canonical body on either side, along x, y, z, metres."""
+    bone_radius_m: float | None = 0.22
+    """Cells with a corner at most this far from a bone are searched at first, metres; null always searches every cell."""
+    surface_radius_m: float = 0.12
+    """Cells at most this far from the rough points of the body that give the grid's box are searched too, metres."""
     prior_falloff_m: float | None = None
     """Prior of the field: weights that fall by a factor e over this distance to a bone, metres; null for no prior."""
     smoothness: float = 0.0

@@ -43,13 +43,38 @@ class NodeWeights:
     """Skinning weights at the grid nodes, evaluated once and used by a search and by what follows it."""
 
     values: Tensor
-    """[D, H, W, J]; where only nodes of active cells were evaluated, the others are zero."""
+    """[D, H, W, J], or [B, D, H, W, J] for weights that differ from pose to pose; where only nodes of active cells were
+    evaluated, the others are zero."""
     grid: CanonicalGrid
     """The box of the nodes."""
 
-    def at(self, canonical: Tensor) -> Tensor:
-        """Return the skinning weights [N, J] at canonical points [N, 3], trilinear between the nodes."""
-        return interpolate(self.values, canonical, self.grid)
+    def at(self, canonical: Tensor, pose_index: Tensor | None = None) -> Tensor:
+        """Return the skinning weights [N, J] at canonical points [N, 3], trilinear between the nodes.
+
+        Args:
+            canonical: [N, 3], metres; points outside the box get the weights of its border.
+            pose_index: [N], the pose of each point, for weights that differ from pose to pose.
+        """
+        if self.values.ndim == 4:
+            return interpolate(self.values, canonical, self.grid)
+        corners, local = self.corners(canonical, pose_index)
+        return (trilinear_weights(local.clamp(0, 1))[..., None] * corners).sum(-2)
+
+    def corners(self, canonical: Tensor, pose_index: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the weights [N, 8, J] at the corners of each point's cell, and its coordinates [N, 3] in the cell.
+
+        Coordinates are beyond 0 to 1 for points outside the box.
+        """
+        shape = self.values.shape[-4:-1]
+        cell, local = locate(canonical, self.grid, shape)
+        corners = cell_corners(cell, shape)
+        if self.values.ndim == 5:
+            if pose_index is None:
+                raise ValueError(
+                    "pose_index: wanted the pose of each point, for weights that differ from pose to pose, got None"
+                )
+            corners = corners + math.prod(shape) * pose_index[:, None]
+        return self.values.reshape(-1, self.values.shape[-1])[corners], local
 
 
 _FAR_M = 100.0  # distance of a bone that is nowhere
@@ -146,7 +171,8 @@ class NetworkWeights(WeightField):
         h = (canonical - self.centre) / self.half_extent
         for layer in self.layers[:-1]:
             h = nn.functional.softplus(layer(h), beta=_SHARPNESS_OF_SOFTPLUS)
-        return self._weights(self.layers[-1](h), canonical)
+        prior = None if self.prior is None else self.softmax.invert(self.prior(canonical))
+        return self._weights(self.layers[-1](h), prior)
 
     @property
     def most_values(self) -> int:
@@ -165,21 +191,19 @@ class NetworkWeights(WeightField):
         weights, biases = [layer.weight for layer in linears], [layer.bias for layer in linears]
         takes_first, takes_extras = [1] + [0] * (len(weights) - 1), [0] * len(weights)
         settings = (takes_first, takes_extras, ACTIVATIONS["softplus"], _SHARPNESS_OF_SOFTPLUS)
-        return self._weights(run_perceptron(first, None, weights, biases, *settings), canonical)
+        prior = None if self.prior is None else self._kept_prior(canonical)
+        return self._weights(run_perceptron(first, None, weights, biases, *settings), prior)
 
-    def _weights(self, outputs: Tensor, canonical: Tensor) -> Tensor:
-        """Return the weights [N, J] for the outputs of the network at canonical points [N, 3]."""
+    def _weights(self, outputs: Tensor, prior: Tensor | None) -> Tensor:
+        """Return the weights [N, J] for the outputs of the network and the logits of the prior, [N, num_logits] each."""
         logits = self.sharpness * outputs
-        return self.softmax(logits if self.prior is None else logits + self._prior_logits(canonical))
+        return self.softmax(logits if prior is None else logits + prior)
 
-    def _prior_logits(self, canonical: Tensor) -> Tensor:
-        """Return the logits of the prior; those of the last tensor of points are kept."""
+    def _kept_prior(self, canonical: Tensor) -> Tensor:
+        """Return the logits of the prior, which are kept for the last tensor of points."""
         assert self.prior is not None
-        if canonical.requires_grad or self._last_points is not canonical:
-            logits = self.softmax.invert(self.prior(canonical))
-            if canonical.requires_grad:
-                return logits
-            self._last_points, self._last_logits = canonical, logits
+        if self._last_points is not canonical:
+            self._last_points, self._last_logits = canonical, self.softmax.invert(self.prior(canonical)).detach()
         return self._last_logits
 
 

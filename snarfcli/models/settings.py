@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from snarfcli.deformer import SearchConfig, SkinningConfig
+from snarfcli.deformer import BodySkinningConfig, SearchConfig
 from snarfcli.shape import ConditionConfig, ShapeConfig
 
 __all__ = ["AvatarConfig", "ModelConfig"]
@@ -39,7 +39,7 @@ class AvatarConfig:
     """Configuration from which the networks of an avatar are built."""
 
     model: ModelConfig
-    skinning: SkinningConfig
+    skinning: BodySkinningConfig
     search: SearchConfig
     shape: ShapeConfig
     condition: ConditionConfig = field(default_factory=ConditionConfig)

@@ -13,7 +13,16 @@ from torch import Tensor
 from snarfcli.native.capacity import fit_to_capacity
 from snarfcli.native.library import native_library
 
-__all__ = ["blend", "blend_backward", "broyden_search", "complete_search", "implicit_backward", "total_variation"]
+__all__ = [
+    "blend",
+    "blend_backward",
+    "broyden_search",
+    "complete_search",
+    "implicit_backward",
+    "prepare_search",
+    "prepared_search",
+    "total_variation",
+]
 
 
 class _Field(Structure):
@@ -216,12 +225,14 @@ def implicit_backward(
     count: int,
     wants_points: bool,
     wants_transforms: bool,
+    into: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return the gradients by the queries and by the transforms; see `ops.implicit_backward`."""
     gradient, canonical = gradient.contiguous(), canonical.contiguous()
     query, jacobian_inverse = query.contiguous(), jacobian_inverse.contiguous()
     v_points = gradient.new_zeros((batch, count, 3) if wants_points else 0)
-    v_transforms = gradient.new_zeros((batch, shape[0] * shape[1] * shape[2], 12) if wants_transforms else 0)
+    size = (batch, shape[0] * shape[1] * shape[2], 12) if wants_transforms else 0
+    v_transforms = gradient.new_zeros(size) if into is None else into
     field = _field(gradient, lower, upper, shape)
     queries = _Queries(None, batch, count, torch.get_num_threads())
     code = _library().snarf_implicit_backward(

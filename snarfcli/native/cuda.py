@@ -76,6 +76,7 @@ def implicit_backward(
     count: int,
     wants_points: bool,
     wants_transforms: bool,
+    into: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return the gradients by the queries and by the transforms; see `ops.implicit_backward`.
 
@@ -84,7 +85,7 @@ def implicit_backward(
     with torch.cuda.device(gradient.device):
         wants = (wants_points, wants_transforms)
         return run_backward(
-            gpu(gradient), gradient, canonical, query, jacobian_inverse, lower, upper, shape, batch, count, *wants
+            gpu(gradient), gradient, canonical, query, jacobian_inverse, lower, upper, shape, batch, count, *wants, into
         )
 
 

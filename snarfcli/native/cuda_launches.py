@@ -218,6 +218,7 @@ def run_backward(
     count: int,
     wants_points: bool,
     wants_transforms: bool,
+    into: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Launch the backward kernel; arguments and results as in `cuda.implicit_backward`."""
     given = {
@@ -229,7 +230,7 @@ def run_backward(
         "upper": upper.to(gradient).contiguous(),
     }
     v_points = gradient.new_zeros((batch, count, 3) if wants_points else 0)
-    v_transforms = gradient.new_zeros((batch, prod(shape), 12) if wants_transforms else 0)
+    v_transforms = gradient.new_zeros((batch, prod(shape), 12) if wants_transforms else 0) if into is None else into
     arguments = _Backward(**{name: tensor.data_ptr() for name, tensor in given.items()})
     arguments.v_points = v_points.data_ptr() if wants_points else None
     arguments.v_transforms = v_transforms.data_ptr() if wants_transforms else None

@@ -7,7 +7,7 @@ import math
 import torch
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton
-from snarfcli.deformer import SkinningConfig
+from snarfcli.deformer import BodySkinningConfig
 from snarfcli.deformer.grid_sides import with_grid_sides
 
 OTHER = Skeleton(("a", "b"), (-1, 0), torch.zeros(2, 3), torch.zeros(2, 3))
@@ -19,12 +19,12 @@ def box(x: float, y: float, z: float) -> torch.Tensor:
 
 def test_smpl_keeps_what_is_set():
     smpl = Skeleton(SMPL_JOINT_NAMES, (-1,) + (0,) * 23, torch.zeros(24, 3), torch.zeros(24, 3))
-    config = SkinningConfig()
+    config = BodySkinningConfig()
     assert with_grid_sides(config, box(0.3, 1.0, 1.8), smpl) is config
 
 
 def test_a_long_animal_has_its_nodes_along_its_length():
-    config = with_grid_sides(SkinningConfig(), box(0.4, 1.2, 1.8), OTHER)
+    config = with_grid_sides(BodySkinningConfig(), box(0.4, 1.2, 1.8), OTHER)
     assert config.margin_m == [0.20, 0.12, 0.12]
     sides = [0.4 + 0.4, 1.2 + 0.24, 1.8 + 0.24]
     cells = [side / count for side, count in zip(sides, config.resolution, strict=True)]
@@ -33,11 +33,11 @@ def test_a_long_animal_has_its_nodes_along_its_length():
 
 
 def test_a_person_of_another_rig_stays_flat():
-    config = with_grid_sides(SkinningConfig(), box(1.75, 1.7, 0.3), OTHER)
+    config = with_grid_sides(BodySkinningConfig(), box(1.75, 1.7, 0.3), OTHER)
     assert config.margin_m == [0.12, 0.12, 0.20]
     assert config.resolution[0] > config.resolution[1] > 2 * config.resolution[2]
 
 
 def test_a_flat_subject_keeps_some_nodes_each_way():
-    config = with_grid_sides(SkinningConfig(margin_m=[0.0, 0.0, 0.0]), box(1.0, 1.0, 0.0), OTHER)
+    config = with_grid_sides(BodySkinningConfig(margin_m=[0.0, 0.0, 0.0]), box(1.0, 1.0, 0.0), OTHER)
     assert min(config.resolution) == 4

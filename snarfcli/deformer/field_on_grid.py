@@ -1,0 +1,274 @@
+"""A weight field and the grid that it is evaluated on: nodes, active cells, and weights at points as the search sees them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from snarfcli.deformer.callables import takes_pose, with_pose
+from snarfcli.deformer.cells import corners_of
+from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.deformer.variation import total_variation
+from snarfcli.deformer.weights import GridWeights, NetworkWeights, NodeWeights, WeightField
+
+__all__ = ["FieldOnGrid"]
+
+_VALUES_AT_ONCE = 2**24  # of a layer, at the nodes; 65,536 nodes with layers of 256
+
+
+class FieldOnGrid(nn.Module):
+    """A weight field, evaluated at the nodes of a grid or, if `searches_field`, used as it is.
+
+    Args:
+        grid: canonical box.
+        shape: nodes (D, H, W).
+        num_bones: J.
+        field: from canonical points [N, 3] to weights [N, J].
+        searches_field: whether roots are those of the field itself and not of its values at the grid nodes.
+        active_cells: [D-1, H-1, W-1], bool, see `set_active_cells`; None for all.
+    """
+
+    lower: Tensor
+    upper: Tensor
+    active_cells: Tensor
+    """[D-1, H-1, W-1], bool, the cells that a complete search looks into; see `set_active_cells`."""
+    _used_nodes: Tensor
+    _active_nodes: Tensor
+    _active_points: Tensor
+    _frozen: Tensor | None
+    field: Callable[..., Tensor]
+
+    def __init__(
+        self,
+        grid: CanonicalGrid,
+        shape: tuple[int, int, int],
+        num_bones: int,
+        field: Callable[..., Tensor],
+        searches_field: bool,
+        active_cells: Tensor | None,
+    ) -> None:
+        super().__init__()
+        self.shape = shape
+        self.num_bones = num_bones
+        self.searches_field = searches_field
+        """Whether roots are those of the field itself and not of its values at the grid nodes."""
+        self.field = field
+        if isinstance(self.field, GridWeights) and self.field.shape != self.shape:
+            raise ValueError(f"field: wanted the grid's nodes {list(self.shape)} (z, y, x), got {list(self.field.shape)}")
+        self.register_buffer("lower", grid.lower.clone())
+        self.register_buffer("upper", grid.upper.clone())
+        self.register_buffer("active_cells", torch.ones([n - 1 for n in self.shape], dtype=torch.bool))
+        self.register_buffer("_used_nodes", torch.empty(0, dtype=torch.bool), persistent=False)
+        self.register_buffer("_active_nodes", torch.empty(0, dtype=torch.long), persistent=False)
+        self.register_buffer("_active_points", torch.empty(0, 3), persistent=False)
+        self.register_buffer("_frozen", None, persistent=False)
+        self.set_active_cells(self.active_cells if active_cells is None else active_cells)
+        self.register_load_state_dict_post_hook(_after_load)
+
+    @property
+    def grid(self) -> CanonicalGrid:
+        """The box of the weight grid."""
+        return CanonicalGrid(self.lower, self.upper, checked=True)
+
+    @property
+    def takes_pose(self) -> bool:
+        """Whether the field has a parameter `pose_index`, so that the weights differ from pose to pose."""
+        return takes_pose(self.field)
+
+    # ---------------------------------------------------------------- weights at the nodes
+    def weight_grid(self, active_only: bool = False, poses: int | None = None) -> Tensor:
+        """Return the skinning weights at the grid nodes, [D, H, W, J], or [B, D, H, W, J] for a field of the pose.
+
+        With `active_only` only the nodes of active cells are evaluated, which are all that a complete search reads; the others
+        are zero. Nothing in it waits for a GPU.
+
+        Args:
+            active_only: whether only nodes of active cells are evaluated.
+            poses: B, for a field with a parameter `pose_index`; otherwise of no effect.
+        """
+        if self._frozen is not None:
+            return self._frozen
+        if self.takes_pose:
+            if poses is None:
+                raise ValueError("poses: wanted the number of poses, for a field with a parameter pose_index, got None")
+            return torch.stack([self._one_grid(active_only, pose) for pose in range(poses)]) if poses else self._no_grid()
+        return self._one_grid(active_only, None)
+
+    def _no_grid(self) -> Tensor:
+        return self.lower.new_empty(0, *self.shape, self.num_bones)
+
+    def _one_grid(self, active_only: bool, pose: int | None) -> Tensor:
+        if not active_only:
+            return self._weights_of_nodes(None, pose).reshape(*self.shape, -1)
+        used = self._active_nodes
+        weights = self._weights_of_nodes(used, pose)
+        return weights.new_zeros(math.prod(self.shape), self.num_bones).index_copy(0, used, weights).reshape(*self.shape, -1)
+
+    def _weights_of_nodes(self, nodes: Tensor | None, pose: int | None) -> Tensor:
+        """Return the weights [K, J] at the active nodes, given as `nodes`, or at all nodes if None."""
+        count = math.prod(self.shape) if nodes is None else len(nodes)
+        if isinstance(self.field, GridWeights):
+            return self._checked(self.field.at_nodes(nodes), count)
+        points = self.grid.nodes(self.shape).reshape(-1, 3) if nodes is None else self._active_points
+        # not a subclass, whose `forward` may be another one
+        if type(self.field) is not NetworkWeights:
+            return self._at_points(points, None if pose is None else torch.full((count,), pose, device=points.device))
+        most = count if torch.is_grad_enabled() else max(1, _VALUES_AT_ONCE // self.field.most_values)
+        if count <= most:
+            return self._checked(self.field.at_fixed_points(points), count)
+        return self._checked(torch.cat([self.field.at_fixed_points(part) for part in points.split(most)]), count)
+
+    def node_weights(self, active_only: bool = False, poses: int | None = None) -> NodeWeights | None:
+        """Evaluate the skinning weights at the grid nodes; None for a field that is searched directly.
+
+        Args:
+            active_only, poses: as in `weight_grid`.
+        """
+        if self.searches_field:
+            return None
+        with torch.autocast(self.lower.device.type, enabled=False):
+            return NodeWeights(self.weight_grid(active_only, poses), self.grid)
+
+    def freeze(self) -> FieldOnGrid:
+        """Switch to evaluation, evaluate the weight grid once and keep it.
+
+        It is kept until the state is loaded anew, or until `train()` is called while the field has something to train: a
+        parameter that requires a gradient, or unknown ones of a plain function.
+
+        Raises:
+            ValueError: the field depends on the pose.
+        """
+        if self.takes_pose:
+            raise ValueError("freeze: wanted a field without a parameter pose_index, whose weights are the same in all poses")
+        self.eval()
+        self._frozen = None
+        with torch.no_grad(), torch.autocast(self.lower.device.type, enabled=False):
+            self._frozen = self.weight_grid()
+        return self
+
+    def train(self, mode: bool = True) -> FieldOnGrid:
+        """Switch between training and evaluation; training discards a frozen weight grid, see `freeze`."""
+        if mode and (
+            not isinstance(self.field, nn.Module) or any(parameter.requires_grad for parameter in self.field.parameters())
+        ):
+            self._frozen = None
+        return super().train(mode)
+
+    # ---------------------------------------------------------------- weights at points
+    def skinning_weights(
+        self, canonical: Tensor, weights: NodeWeights | None = None, pose_index: Tensor | None = None
+    ) -> Tensor:
+        """Return the skinning weights [N, J] at canonical points [N, 3], as the search uses them; differentiable.
+
+        Only the nodes around the points are evaluated, if they are few. The weights are exact also under autocast.
+
+        Args:
+            canonical: [N, 3], metres; points outside the grid get the weights of its border.
+            weights: from `node_weights`, if they have been evaluated already; the points must then lie in cells whose nodes
+                were evaluated.
+            pose_index: [N], the pose of each point, for weights that differ from pose to pose.
+        """
+        canonical = canonical.to(self.lower.dtype)
+        with torch.autocast(canonical.device.type, enabled=False):
+            if self.searches_field:
+                return self._at_points(canonical, pose_index)
+            if weights is None and self._frozen is not None:
+                weights = NodeWeights(self._frozen, self.grid)
+            if weights is not None:
+                return weights.at(canonical, pose_index)
+            corners, local = self.corner_weights(canonical, pose_index)
+            return (trilinear_weights(local.clamp(0, 1))[..., None] * corners).sum(-2)
+
+    def corner_weights(self, canonical: Tensor, pose_index: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the weights [N, 8, J] at the corners of each point's cell, and its coordinates [N, 3] in the cell.
+
+        Coordinates are beyond 0 to 1 for points outside the grid. For arguments see `skinning_weights`.
+        """
+        nodes = math.prod(self.shape)
+        if self._frozen is not None or (8 * len(canonical) >= nodes and not self.takes_pose):
+            return NodeWeights(self.weight_grid(), self.grid).corners(canonical, pose_index)
+        cell, local = locate(canonical, self.grid, self.shape)
+        corners = cell_corners(cell, self.shape)
+        if self.takes_pose:
+            corners = corners + nodes * self._known(pose_index)[:, None]
+        used, place = corners.unique(return_inverse=True)
+        if isinstance(self.field, GridWeights):
+            weights = self._checked(self.field.at_nodes(used), len(used))
+        else:
+            points = self.grid.nodes(self.shape).reshape(-1, 3)[used % nodes]
+            weights = self._at_points(points, used // nodes)
+        return weights[place], local
+
+    def _at_points(self, points: Tensor, pose_index: Tensor | None) -> Tensor:
+        """Return the weights [N, J] of the field itself at points [N, 3]."""
+        if not self.takes_pose:
+            return self._checked(self.field(points), len(points))
+        return self._checked(with_pose(self.field)(points, self._known(pose_index)), len(points))
+
+    def _known(self, pose_index: Tensor | None) -> Tensor:
+        if pose_index is None:
+            raise ValueError("pose_index: wanted the pose of each point, for a field with a parameter pose_index, got None")
+        return pose_index
+
+    def _checked(self, weights: Tensor, count: int) -> Tensor:
+        """Return the weights of a field, or raise ValueError if their shape is wrong."""
+        if tuple(weights.shape) != (count, self.num_bones):
+            raise ValueError(f"field: wanted weights of shape [{count}, {self.num_bones}], got {list(weights.shape)}")
+        return weights.to(self.lower.dtype)
+
+    def smoothness(self, weights: NodeWeights | None = None) -> Tensor:
+        """Return the total variation of the weights over the nodes of active cells (see `total_variation`).
+
+        Args:
+            weights: from `node_weights`, if they have been evaluated already.
+        """
+        values = self.weight_grid(active_only=True) if weights is None else weights.values
+        return total_variation(values, self.grid, self._used_nodes)
+
+    # ---------------------------------------------------------------- cells
+    def set_active_cells(self, cells: Tensor) -> None:
+        """Choose the cells that a complete search looks into, [D-1, H-1, W-1], bool; they are saved with the state.
+
+        Waits for a GPU, so that a search need not.
+
+        Raises:
+            ValueError: the shape or dtype differs, or no cell is left.
+        """
+        wanted = [n - 1 for n in self.shape]
+        if list(cells.shape) != wanted or cells.dtype != torch.bool:
+            raise ValueError(f"active_cells: wanted bool {wanted}, got {cells.dtype} {list(cells.shape)}")
+        if not bool(cells.any()):
+            raise ValueError("active_cells: wanted at least one cell, got none")
+        self.active_cells.copy_(cells)
+        self._update_active_nodes()
+
+    def _update_active_nodes(self) -> None:
+        """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
+        self._used_nodes = corners_of(self.active_cells)
+        self._active_nodes = self._used_nodes.reshape(-1).nonzero()[:, 0]
+        self._active_points = self.grid.nodes(self.shape).reshape(-1, 3)[self._active_nodes]
+
+    def is_active(self, canonical: Tensor) -> Tensor:
+        """Return whether canonical points [N, 3] lie in cells that a complete search looks into, [N], bool."""
+        cell, local = locate(canonical, self.grid, self.shape)
+        return ((local >= 0) & (local <= 1)).all(1) & self.active_cells.reshape(-1)[cell]
+
+    def random_canonical(self, count: int, generator: torch.Generator) -> Tensor:
+        """Return canonical points [count, 3] spread evenly over the active cells, metres."""
+        cells = self.active_cells.nonzero()
+        chosen = torch.randint(len(cells), (count,), generator=generator).to(cells.device)
+        places = torch.rand(count, 3, generator=generator).to(self.lower)
+        return self.lower + (cells[chosen].flip(1) + places) * self.grid.cell_size(self.shape)
+
+
+def _after_load(module: FieldOnGrid, incompatible: object) -> None:
+    """Update what follows from the state after load_state_dict: the field's box and the nodes of active cells."""
+    module._frozen = None
+    if not bool(module.active_cells.any()):
+        raise ValueError("active_cells: wanted at least one cell, got none")
+    module._update_active_nodes()
+    if isinstance(module.field, WeightField):
+        module.field.set_box(module.grid)

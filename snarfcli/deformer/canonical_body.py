@@ -19,6 +19,7 @@ from snarfcli.deformer.hierarchy import PlainSoftmax
 from snarfcli.deformer.skinning import skin
 from snarfcli.deformer.skinning_config import BodySkinningConfig, SkinningConfig
 from snarfcli.deformer.weights import GridWeights, VoxelWeights
+from snarfcli.field_docs import documented
 
 __all__ = ["CanonicalBody", "canonical_body", "weights_around"]
 
@@ -26,6 +27,7 @@ _ADULT_M = 1.75  # longest side of SMPL's body in the canonical pose, for which 
 _LEAST_WEIGHT = 1e-5  # of trained weights: a weight of zero has no gradient. 24 bones 1 m away move a point by 0.2 mm
 
 
+@documented
 @dataclass(frozen=True, eq=False)
 class CanonicalBody:
     """A body in the canonical pose of a deformer, and the grid around it."""

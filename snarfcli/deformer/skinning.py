@@ -180,8 +180,8 @@ def _cofactors(blended: Tensor) -> tuple[list[Tensor], Tensor]:
 
 def _check(weights: Tensor, bone_transforms: Tensor, **points: Tensor | None) -> None:
     """Raise ValueError or TypeError if weights, transforms and what stands at the points, [..., N, 3] each, do not fit."""
-    tensors = {name: tensor for name, tensor in points.items() if tensor is not None}
-    tensors |= {"weights": weights, "bone_transforms": bone_transforms}
+    given = {name: tensor for name, tensor in points.items() if tensor is not None}
+    tensors = {**given, "weights": weights, "bone_transforms": bone_transforms}
     first, reference = next(iter(tensors.items()))
     if reference.ndim < 2 or (first != "weights" and reference.shape[-1] != 3):
         raise ValueError(f"{first}: wanted shape [..., N, {'J' if first == 'weights' else 3}], got {list(reference.shape)}")
@@ -193,7 +193,8 @@ def _check(weights: Tensor, bone_transforms: Tensor, **points: Tensor | None) ->
     for name, tensor in tensors.items():
         end = ends.get(name, (count, 3))
         own = tensor.shape[: -len(end)]
-        fits = all(a == b or 1 in (a, b) for a, b in zip(reversed(own), reversed(leading), strict=False))
+        both = range(-min(len(own), len(leading)), 0)
+        fits = all(own[axis] == leading[axis] or 1 in (own[axis], leading[axis]) for axis in both)
         if tensor.ndim < len(end) or tensor.shape[-len(end) :] != end or not fits:
             raise ValueError(f"{name}: wanted shape {[*leading, *end]} to fit the others, got {list(tensor.shape)}")
         leading = torch.broadcast_shapes(leading, own)

@@ -7,6 +7,7 @@ other dtypes, the readable version does.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import List  # noqa: UP035
 
 import torch
 from torch import Tensor
@@ -163,7 +164,7 @@ def perceptron_backward(
     sharpness: float,
     wants_first: bool,
     wants_extras: bool,
-) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor]]:
+) -> tuple[Tensor, Tensor, List[Tensor], List[Tensor]]:  # noqa: UP006  # PyTorch 2.6 knows no other as a result
     """Return the gradients of a loss by `first` and `extras`, empty where not wanted, by weights and by biases."""
     settings = (takes_first, takes_extras, activation, sharpness)
     return _backward_reference(gradient, first, extras, weights, biases, *settings, wants=(wants_first, wants_extras))

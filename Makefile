@@ -74,6 +74,7 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_evaluation.py
 	$(VENV)/bin/python benchmarks/bm_extraction.py
 	$(VENV)/bin/python benchmarks/bm_shape.py
+	$(VENV)/bin/python benchmarks/bm_diffusion.py
 	$(VENV)/bin/python benchmarks/bm_networks.py
 	$(VENV)/bin/python benchmarks/bm_surfaces.py
 	$(VENV)/bin/python benchmarks/bm_loose_pieces.py

@@ -2,59 +2,63 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
+from snarfcli.deformer.multigrid import Multigrid
+
 __all__ = ["harmonic"]
 
-_MOST_STEPS = 2000
+_MOST_STEPS = 100  # a step divides the error by about four; so many are taken only where the precision does not suffice
+_VALUES_AT_ONCE = 2**20  # bounds the memory; columns that are solved together stay in a processor's cache
 
 
-def harmonic(start: Tensor, fixed: Tensor, cell_size: Tensor, solved: float) -> Tensor:
+def harmonic(
+    start: Tensor, fixed: Tensor, cell_size: Tensor, solved: float, progress: Callable[[int], object] | None = None
+) -> Tensor:
     """Solve Laplace's equation on a grid: the mean of its neighbours at each free node, with nothing flowing over the border.
 
-    Conjugate gradients, all J right-hand sides at once, with the diagonal as preconditioner.
+    Conjugate gradients, several columns at once, with a multigrid cycle as preconditioner; the number of steps hardly depends
+    on the number of nodes.
 
     Args:
         start: [D, H, W, J], values that are kept at fixed nodes, and from which the search starts at free ones.
-        fixed: [D, H, W], bool.
+        fixed: [D, H, W], bool, at least one.
         cell_size: [3], along x, y, z, metres; neighbours count by 1 / distance^2.
-        solved: largest change of a value by one more step. For weights: with 1e-5 none differs from that with 1e-4 by more than
-            0.5 %.
+        solved: largest change of a value by one more cycle. The largest error is about the same (1.3e-3 with 1e-3 on
+            128 x 128 x 32 nodes around the built-in body).
+        progress: called with the number of columns that have been solved since the call before.
 
     Returns:
         [D, H, W, J].
     """
-    free = (~fixed)[..., None].to(start)
-    conductance = [1 / cell_size[2 - axis].square() for axis in range(3)]
+    multigrid = Multigrid(~fixed, cell_size.flip(0))
+    columns = start.permute(3, 0, 1, 2)
+    at_once = max(1, _VALUES_AT_ONCE // fixed.numel())
+    values = torch.empty_like(start)
+    for first in range(0, len(columns), at_once):
+        some = columns[first : first + at_once].contiguous()
+        values[..., first : first + at_once] = _solve(some, multigrid, solved).permute(1, 2, 3, 0)
+        if progress is not None:
+            progress(len(some))
+    return values
 
-    def laplacian(values: Tensor) -> Tensor:
-        out = torch.zeros_like(values)
-        for axis in range(3):
-            count = values.shape[axis] - 1
-            flow = conductance[axis] * (values.narrow(axis, 1, count) - values.narrow(axis, 0, count))
-            out.narrow(axis, 0, count).sub_(flow)
-            out.narrow(axis, 1, count).add_(flow)
-        return out
 
-    diagonal = torch.zeros_like(free)
-    for axis in range(3):
-        count = free.shape[axis] - 1
-        diagonal.narrow(axis, 0, count).add_(conductance[axis])
-        diagonal.narrow(axis, 1, count).add_(conductance[axis])
-    values = start.clone()
-    residual = -laplacian(values) * free
-    scaled = residual / diagonal
-    direction = scaled.clone()
-    size = (residual * scaled).sum((0, 1, 2))
+def _solve(values: Tensor, multigrid: Multigrid, solved: float) -> Tensor:
+    """Solve for columns [K, D, H, W]."""
+    residual = multigrid.residuals(values)
+    direction, before = torch.zeros_like(values), None
     for _ in range(_MOST_STEPS):
-        if not bool((scaled.abs() > solved).any()):
-            break
-        moved = laplacian(direction) * free
-        length = size / (direction * moved).sum((0, 1, 2)).clamp_min(1e-30)
-        values = values + length * direction
-        residual = residual - length * moved
-        scaled = residual / diagonal
-        before, size = size, (residual * scaled).sum((0, 1, 2))
-        direction = scaled + (size / before.clamp_min(1e-30)) * direction
+        correction = multigrid.cycle(residual)
+        if not bool((correction.abs() > solved).any()):
+            return values + correction
+        size = (residual * correction).sum((1, 2, 3), keepdim=True)
+        share = torch.zeros_like(size) if before is None else size / before.clamp_min(1e-30)
+        direction, before = torch.addcmul(correction, share, direction), size
+        moved = multigrid.apply(direction)
+        length = size / (direction * moved).sum((1, 2, 3), keepdim=True).clamp_min(1e-30)
+        values = torch.addcmul(values, length, direction)
+        residual = torch.addcmul(residual, length, moved, value=-1)
     return values

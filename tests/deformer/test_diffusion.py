@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 import torch
 from skinning_scenes import unit_grid
 
-from snarfcli.deformer import PresetWeights
+from snarfcli.deformer import PresetWeights, diffusion
 from snarfcli.deformer.diffusion import diffuse_weights
 from snarfcli.deformer.skinning import interpolate
 
@@ -72,6 +73,51 @@ def test_one_vertex_fills_the_grid():
     torch.testing.assert_close(values[..., 1], torch.ones(2, 2, 2))
 
 
+@pytest.mark.parametrize("shape", [(2, 2, 2), (5, 9, 33), (4, 40, 7)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_any_size_of_grid(shape, dtype):
+    points, weights = tube(1000)
+    values = diffuse_weights(points, weights, unit_grid(dtype), shape)
+    assert values.shape == (*shape, 3)
+    assert values.dtype == dtype
+    assert bool((values >= 0).all())
+    torch.testing.assert_close(values.sum(-1), torch.ones(shape, dtype=dtype))
+
+
+@pytest.mark.parametrize("count", [3, 800])
+def test_nearest_vertices_are_those_of_all(count):
+    """Block by block of nodes, with far fewer distances than all pairs have."""
+    shape, (points, _) = (9, 20, 12), tube(count)
+    nodes = unit_grid().nodes(shape).reshape(-1, 3)
+    some = torch.arange(0, len(nodes), 7)
+    distances = torch.cdist(nodes[some], points).topk(min(8, count), largest=False).values
+    met = torch.zeros(len(some), dtype=torch.long)
+    for block in diffusion._blocks(some, shape):
+        squared, index = diffusion._nearest(nodes[some[block]], points)
+        met[block] += 1
+        torch.testing.assert_close(squared.sqrt(), distances[block])
+        torch.testing.assert_close((nodes[some[block], None] - points[index]).norm(dim=-1), distances[block])
+    assert bool((met == 1).all())
+
+
+def test_progress_is_told():
+    points, weights = tube(100)
+    shares = []
+    PresetWeights.from_vertices(points, weights, unit_grid(), (4, 5, 6), shares.append)
+    assert shares == [1.0]
+
+
+def test_long_work_shows_a_bar_on_a_terminal(monkeypatch, capsys):
+    pytest.importorskip("tqdm")
+    points, weights = tube(100)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    diffuse_weights(points, weights, unit_grid(), (4, 5, 6))
+    assert not capsys.readouterr().err
+    monkeypatch.setattr(diffusion, "_LONG", 1)
+    diffuse_weights(points, weights, unit_grid(), (4, 5, 6))
+    assert "diffuse weights: 100%" in capsys.readouterr().err
+
+
 def test_preset_weights_are_kept_in_the_state_and_not_trained():
     points, weights = tube(300)
     field = PresetWeights.from_vertices(points, weights, unit_grid(), (8, 8, 8))
@@ -96,5 +142,6 @@ def test_preset_weights_are_kept_in_the_state_and_not_trained():
     ],
 )
 def test_what_cannot_be_used_is_rejected(change, message):
+    vertices, weights = change(*tube(50))
     with pytest.raises(ValueError, match=message):
-        diffuse_weights(*change(*tube(50)), unit_grid(), (4, 4, 4))
+        diffuse_weights(vertices, weights, unit_grid(), (4, 4, 4))

@@ -188,7 +188,7 @@ int snarf_prepare(const snarf_field* field, int64_t poses, const uint8_t* active
 
 int snarf_take_prepared(snarf_prepared* prepared, void* buffer, void* boxes) {
   const std::unique_ptr<snarf_prepared> owner(prepared);
-  if (!prepared || !buffer || !boxes) return SNARF_OK;
+  if (!prepared || !buffer) return SNARF_OK;
   std::memcpy(buffer, owner->buffer.get(), size_t(owner->bytes));
   return in_number_type(header_of(owner->buffer.get()).bytes_per_number,
                         [&](auto number) { copy_boxes(owner->buffer.get(), static_cast<decltype(number)*>(boxes)); });

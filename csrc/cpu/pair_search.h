@@ -373,10 +373,10 @@ void search_prepared(const PreparedTask<S>& task, int64_t first, int64_t last, R
           fetch(task.cells + cell);
           pairs[waiting++] = {bins[k].query, cell, 0};
         }
-        if (waiting < width) continue;
-        search.add(pairs, width);
-        waiting -= width;
-        for (int i = 0; i < waiting; ++i) pairs[i] = pairs[width + i];
+        int done = 0;
+        for (; waiting - done >= width; done += width) search.add(pairs + done, width);
+        waiting -= done;
+        for (int i = 0; done && i < waiting; ++i) pairs[i] = pairs[done + i];
       }
   }
   for (int done = 0; done < waiting; done += width) search.add(pairs + done, waiting - done < width ? waiting - done : width);

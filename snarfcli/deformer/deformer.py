@@ -206,7 +206,7 @@ class ForwardDeformer(FieldOnGrid):
                 )
             if weights is None:
                 weights = self._searched_weights(len(bone_transforms))
-            cells = self._searched_cells
+            cells = None if self._searched_cells is None else self._searched_cells.clone()
             if not self._sums_to_one:
                 check_values(self.grid, bone_transforms, weights.values, cells)
             poses = BlendedPoses.of(bone_transforms, weights.values, self.grid, self.search, cells)

@@ -35,7 +35,7 @@ struct snarf_prepared {
 namespace snarf {
 
 constexpr int64_t kPreparedMark = 0x31706e7366726e73;  // tells a buffer of this layout from other data
-constexpr int kMostBins = 64;                          // that a cell may touch; more on the coarsest level only
+constexpr int kMostBins = 4096;                          // that a cell may touch; more on the coarsest level only
 constexpr double kFineBin = 1.0;                       // side of a bin of level 0, in the median of the boxes' longest sides
 constexpr int64_t kQueriesAtOnce = 512;                // that a thread takes
 

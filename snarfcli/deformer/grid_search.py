@@ -124,7 +124,8 @@ class BlendedPoses:
     def correspondences(self, points: Tensor, found: tuple[Tensor, Tensor, Tensor, Tensor]) -> Correspondences:
         """Return what a search for points [B, N, 3] has found, in the given canonical frame."""
         canonical, query, jacobian_inverse, total = found
-        canonical = self.centred.restored(canonical, query < points.shape[0] * points.shape[1])
+        if self.centred.canonical_origin is not None:
+            canonical = self.centred.restored(canonical, query < points.shape[0] * points.shape[1])
         return Correspondences(canonical, query, jacobian_inverse.detach(), points.shape[0], points.shape[1], total)
 
 

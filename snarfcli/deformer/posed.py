@@ -158,12 +158,14 @@ class PosedGrid(PosedDeformer):
         self._searched = _Gathered(poses)
         self._everywhere = everywhere
         self._all_nodes: _Gathered | None = None
-        self._prepared: Tensor | None = None
+        self._cells: cpu.PreparedCells | None = None
         self._boxes: Tensor | None = None
         search, device = poses.search, poses.transforms.device.type
         if search.name == "complete" and device == "cpu" and choose_backend(search.backend, device) == "native":
+            limits = (search.tolerance, search.max_steps, search.orientation_preserving)
             still = self._searched.still
-            self._prepared, self._boxes = cpu.prepare_search(still.transforms, *still.box, still.active_cells)
+            self._cells = cpu.PreparedCells(still.transforms, *still.box, still.active_cells, *limits)
+            self._boxes = self._cells.boxes
 
     def __call__(self, points: Tensor, capacity: int | None = None, starts: Tensor | None = None) -> Correspondences:
         """As described for `PosedDeformer`."""
@@ -171,20 +173,21 @@ class PosedGrid(PosedDeformer):
         check_points(points, self.bone_transforms)
         check_capacity(capacity)
         check_starts(starts, points, poses.search)
-        with torch.autocast(points.device.type, enabled=False):
-            near = poses.centred.points(points)
-            if torch.compiler.is_compiling():  # the operators can be compiled, and what gathers their gradients cannot
-                return poses.correspondences(points, poses.find(near, starts, capacity))
+        near = poses.centred.points(points)
+        if torch.compiler.is_compiling():  # the operators can be compiled, and what gathers their gradients cannot
+            return poses.correspondences(points, poses.find(near, starts, capacity))
+        if torch.is_grad_enabled() and (near.requires_grad or self._searched.gradients.ticket.requires_grad):
             found: Any = _Roots.apply(near, self._searched.gradients.ticket, self, starts, capacity)
-            return poses.correspondences(points, found)
+        else:
+            found = self.find(near, starts, capacity)
+        return poses.correspondences(points, found)
 
     def find(self, near: Tensor, starts: Tensor | None, capacity: int | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Search for points [B, N, 3] in the moved frames, without gradients; returns what the operators return."""
-        still = self._searched.still
-        if self._prepared is None:
-            return still.find(near, starts, capacity)
-        settings = (still.search.tolerance, still.search.max_steps, still.search.orientation_preserving, capacity)
-        return cpu.prepared_search(near, still.transforms, *still.box, self._prepared, *settings)
+        if self._cells is not None:
+            return self._cells.find(near, capacity)
+        with torch.no_grad(), torch.autocast(near.device.type, enabled=False):
+            return self._searched.still.find(near, starts, capacity)
 
     def pull_back(self, roots: tuple[Tensor, ...], count: int, wants: tuple[bool, bool]) -> Tensor:
         """Return the gradient by the queries, [B, N, 3], from (the gradient by the roots, roots, queries, J^-1).

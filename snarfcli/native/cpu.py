@@ -14,13 +14,12 @@ from snarfcli.native.capacity import fit_to_capacity
 from snarfcli.native.library import native_library
 
 __all__ = [
+    "PreparedCells",
     "blend",
     "blend_backward",
     "broyden_search",
     "complete_search",
     "implicit_backward",
-    "prepare_search",
-    "prepared_search",
     "total_variation",
 ]
 
@@ -138,51 +137,58 @@ def complete_search(
     return fit_to_capacity(*found, points, capacity)
 
 
-def prepare_search(
-    transforms: Tensor, lower: Tensor, upper: Tensor, shape: Sequence[int], active_cells: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Sort the cells of poses by their images, for `prepared_search`.
+class PreparedCells:
+    """The cells of poses, sorted by their images once for many searches with few queries each.
 
     Args:
-        transforms: [B, D * H * W, 12], blended transforms at the nodes; those that every search is given.
+        transforms: [B, D * H * W, 12], blended transforms at the nodes.
+        lower, upper, shape, active_cells, tolerance, max_steps, orientation_preserving: as for `complete_search`.
 
-    Returns:
-        A buffer, [K], uint8, and the corners of the box around the images of each pose, [B, 2, 3], metres.
+    Raises:
+        MemoryError: there is not enough memory.
     """
-    library, transforms = _library(), transforms.contiguous()
-    active = None if active_cells is None else active_cells.contiguous()
-    field = _field(transforms, lower, upper, shape)
-    handle, size = c_void_p(), c_int64()
-    cells = None if active is None else c_void_p(active.data_ptr())
-    threads = c_int32(torch.get_num_threads())
-    _raise_for(library.snarf_prepare(byref(field), c_int64(len(transforms)), cells, threads, byref(handle), byref(size)))
-    try:
-        buffer, boxes = torch.empty(size.value, dtype=torch.uint8), transforms.new_empty(len(transforms), 2, 3)
-    except BaseException:
-        library.snarf_take_prepared(handle, None, None)
-        raise
-    library.snarf_take_prepared(handle, c_void_p(buffer.data_ptr()), c_void_p(boxes.data_ptr()))
-    return buffer, boxes
 
+    boxes: Tensor
+    """[B, 2, 3], lower and upper corner of the box around the images of each pose, metres."""
 
-def prepared_search(
-    points: Tensor,
-    transforms: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    shape: Sequence[int],
-    buffer: Tensor,
-    tolerance: float,
-    max_steps: int,
-    orientation_preserving: bool,
-    capacity: int | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Find the same roots as `complete_search` in the cells that `prepare_search` has sorted."""
-    points = points.contiguous()
-    settings = _Complete(None, tolerance * _longest_side(lower, upper), max_steps, orientation_preserving)
-    place = (c_void_p(buffer.data_ptr()), c_int64(len(buffer)))
-    found = _search("snarf_prepared_search", _field(transforms, lower, upper, shape), points, settings, place)
-    return fit_to_capacity(*found, points, capacity)
+    def __init__(
+        self,
+        transforms: Tensor,
+        lower: Tensor,
+        upper: Tensor,
+        shape: Sequence[int],
+        active_cells: Tensor | None,
+        tolerance: float,
+        max_steps: int,
+        orientation_preserving: bool,
+    ) -> None:
+        library = _library()
+        self._transforms = transforms.contiguous()  # kept alive: the field has its address
+        self._field = _field(self._transforms, lower, upper, shape)
+        self._settings = _Complete(None, tolerance * _longest_side(lower, upper), max_steps, orientation_preserving)
+        active = None if active_cells is None else active_cells.contiguous()
+        cells = None if active is None else c_void_p(active.data_ptr())
+        batch, threads = c_int64(len(transforms)), c_int32(torch.get_num_threads())
+        handle, size = c_void_p(), c_int64()
+        _raise_for(library.snarf_prepare(byref(self._field), batch, cells, threads, byref(handle), byref(size)))
+        try:
+            self._buffer, self.boxes = torch.empty(size.value, dtype=torch.uint8), transforms.new_empty(len(transforms), 2, 3)
+        except BaseException:
+            library.snarf_take_prepared(handle, None, None)
+            raise
+        library.snarf_take_prepared(handle, c_void_p(self._buffer.data_ptr()), c_void_p(self.boxes.data_ptr()))
+        self._place = (c_void_p(self._buffer.data_ptr()), size)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the sorted cells."""
+        return len(self._buffer)
+
+    def find(self, points: Tensor, capacity: int | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Find the same roots of points [B, N, 3] as `complete_search`; may be called by several threads at once."""
+        points = points.contiguous()
+        found = _search("snarf_prepared_search", self._field, points, self._settings, self._place)
+        return fit_to_capacity(*found, points, capacity)
 
 
 def broyden_search(

@@ -85,6 +85,7 @@ struct CellRecord {
 struct PreparedLevel {
   int32_t bins[3];
   int64_t bins_before;  // in finer levels
+  bool is_empty;        // of cells
 };
 
 constexpr int kMostLevels = 6;

@@ -346,6 +346,7 @@ void search_prepared(const PreparedTask<S>& task, int64_t first, int64_t last, R
       for (int i = 0; i < 3; ++i) share[i] = share_along(pose, i, point[i]);
       for (int level = 0; level < pose.levels; ++level) {
         const PreparedLevel& in = pose.level[level];
+        if (in.is_empty) continue;
         QueryBin& to = bins[count++];
         int64_t at[3];
         for (int i = 0; i < 3; ++i) {

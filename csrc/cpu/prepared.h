@@ -35,7 +35,7 @@ struct snarf_prepared {
 namespace snarf {
 
 constexpr int64_t kPreparedMark = 0x31706e7366726e73;  // tells a buffer of this layout from other data
-constexpr int kMostBins = 4096;                          // that a cell may touch; more on the coarsest level only
+constexpr int kMostBins = 128;                         // that a cell may touch; more on the coarsest level only
 constexpr double kFineBin = 1.0;                       // side of a bin of level 0, in the median of the boxes' longest sides
 constexpr int64_t kQueriesAtOnce = 512;                // that a thread takes
 
@@ -127,6 +127,7 @@ void lay_out_bins(SortedCells<S>& out) {
   for (int64_t bins = 0; bins != 1 && pose.levels < kMostLevels; ++pose.levels) {
     PreparedLevel& level = pose.level[pose.levels];
     level.bins_before = pose.bins;
+    level.is_empty = true;
     bins = 1;
     for (int i = 0; i < 3; ++i) {
       level.bins[i] = ((int32_t(bins_along(i)) - 1) >> (kCoarserBits * pose.levels)) + 1;
@@ -182,6 +183,7 @@ void sort_cells(SortedCells<S>& out) {
   PreparedPose<S>& pose = out.pose;
   std::vector<int32_t> next(size_t(pose.bins), 0);  // number of cells of each bin, then place of its next one
   each_cell(out, [&](int32_t, const TouchedBins& touched) {
+    pose.level[touched.level].is_empty = false;
     touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t*) { ++next[bin]; });
   });
   out.first.assign(size_t(pose.bins + 1), 0);

@@ -137,6 +137,9 @@ def complete_search(
     return fit_to_capacity(*found, points, capacity)
 
 
+_MANY = 2  # queries per cell: sorting these is faster than going through the sorted cells
+
+
 class PreparedCells:
     """The cells of poses, sorted by their images once for many searches with few queries each.
 
@@ -163,11 +166,14 @@ class PreparedCells:
         orientation_preserving: bool,
     ) -> None:
         library = _library()
-        self._transforms = transforms.contiguous()  # kept alive: the field has its address
+        # kept alive: the structures have their addresses
+        self._transforms = transforms.contiguous()
+        every = torch.ones([n - 1 for n in shape], dtype=torch.bool)
+        self._active = every if active_cells is None else active_cells.contiguous()
+        self._count = int(self._active.sum())
         self._field = _field(self._transforms, lower, upper, shape)
-        self._settings = _Complete(None, tolerance * _longest_side(lower, upper), max_steps, orientation_preserving)
-        active = None if active_cells is None else active_cells.contiguous()
-        cells = None if active is None else c_void_p(active.data_ptr())
+        cells = c_void_p(self._active.data_ptr())
+        self._settings = _Complete(cells, tolerance * _longest_side(lower, upper), max_steps, orientation_preserving)
         batch, threads = c_int64(len(transforms)), c_int32(torch.get_num_threads())
         handle, size = c_void_p(), c_int64()
         _raise_for(library.snarf_prepare(byref(self._field), batch, cells, threads, byref(handle), byref(size)))
@@ -187,7 +193,10 @@ class PreparedCells:
     def find(self, points: Tensor, capacity: int | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Find the same roots of points [B, N, 3] as `complete_search`; may be called by several threads at once."""
         points = points.contiguous()
-        found = _search("snarf_prepared_search", self._field, points, self._settings, self._place)
+        if points.shape[1] > _MANY * self._count:
+            found = _search("snarf_complete_search", self._field, points, self._settings)
+        else:
+            found = _search("snarf_prepared_search", self._field, points, self._settings, self._place)
         return fit_to_capacity(*found, points, capacity)
 
 

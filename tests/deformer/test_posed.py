@@ -22,6 +22,7 @@ from snarfcli.deformer import (
     find_correspondences,
 )
 from snarfcli.deformer.weights import GridWeights
+from snarfcli.native import cpu
 
 SHAPE = (6, 7, 8)
 
@@ -65,8 +66,9 @@ def assert_same(found, wanted, atol: float = 0.0) -> None:
     ("bones", "angle", "shape"),
     [(2, 1.5, (5, 7, 9)), (24, 1.0, (6, 9, 17)), (55, 1.2, (12, 9, 8)), (5, 2.5, (2, 2, 2)), (7, 2.0, (3, 4, 37))],
 )
-def test_roots_are_those_of_an_unprepared_search(backend, dtype, bones, angle, shape):
+def test_roots_are_those_of_an_unprepared_search(backend, dtype, bones, angle, shape, monkeypatch):
     """Folds included, where cells are cut into parts; the search that is compared with is compared with an exhaustive one."""
+    monkeypatch.setattr(cpu, "_MANY", math.inf)  # not for many queries, which are searched as without preparation
     count = 300 if backend == "native" else 60
     points, transforms, weights = scene(dtype, 2, count, bones, angle, shape, 3)
     deformer = deformer_of(weights, SearchConfig(backend=backend))
@@ -111,7 +113,9 @@ def test_broyden_searches_and_fields_are_posed_too():
         assert_same(posed(points, starts=starts), deformer(points, transforms, starts=starts))
 
 
-def test_points_anywhere_are_answered():
+@pytest.mark.parametrize("many", [0, math.inf])
+def test_points_anywhere_are_answered(many, monkeypatch):
+    monkeypatch.setattr(cpu, "_MANY", many)
     points, transforms, weights = scene()
     points[0, 0, 1] = math.nan
     points[0, 1] = math.inf

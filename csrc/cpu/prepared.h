@@ -65,7 +65,8 @@ class Cursor {
   }
   template <class T>
   void write(const T* values, int64_t count) {
-    std::memcpy(static_cast<void*>(next<T>(count)), values, size_t(count) * sizeof(T));
+    T* const to = next<T>(count);
+    if (count) std::memcpy(static_cast<void*>(to), values, size_t(count) * sizeof(T));
   }
 
  private:
@@ -75,7 +76,7 @@ class Cursor {
 // One pose's cells, bounded and sorted into bins, before they are copied into the buffer.
 template <class S>
 struct SortedCells {
-  PreparedPose<S> pose;
+  PreparedPose<S> pose{};
   std::vector<CellRecord<S>> cells;
   std::vector<S> boxes;        // half extents, [C, 3], metres
   std::vector<int32_t> first;  // group of each bin, [bins + 1]

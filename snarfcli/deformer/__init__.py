@@ -3,6 +3,7 @@
 Usable alone, in any neural field: see `ForwardDeformer`.
 """
 
+from snarfcli.deformer.bone_prior import BonePrior
 from snarfcli.deformer.canonical_body import CanonicalBody
 from snarfcli.deformer.cells import cells_near
 from snarfcli.deformer.correspondences import Correspondences
@@ -16,7 +17,7 @@ from snarfcli.deformer.posed import PosedDeformer
 from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.skinning import blend_transforms, blended_matrices, inverse_skin, skin
 from snarfcli.deformer.skinning_config import BodySkinningConfig, SkinningConfig
-from snarfcli.deformer.weights import BonePrior, NodeWeights, WeightField
+from snarfcli.deformer.weights import NodeWeights, WeightField
 
 __all__ = [
     "BodySkinningConfig",

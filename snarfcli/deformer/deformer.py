@@ -8,6 +8,7 @@ from typing import overload
 import torch
 from torch import Tensor
 
+from snarfcli.deformer.bone_prior import BonePrior
 from snarfcli.deformer.canonical_body import CanonicalBody, canonical_body, weights_around
 from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.correspondences import Correspondences
@@ -21,7 +22,7 @@ from snarfcli.deformer.posed import PosedDeformer, PosedField, PosedGrid
 from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.deformer.skinning_config import FIELDS, SkinningConfig
-from snarfcli.deformer.weights import BonePrior, NetworkWeights, NodeWeights, VoxelWeights, WeightField
+from snarfcli.deformer.weights import NetworkWeights, NodeWeights, VoxelWeights, WeightField
 
 __all__ = ["ForwardDeformer"]
 

@@ -19,7 +19,7 @@ from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.datasets.subjects import SubjectData
-from snarfcli.deformer.weights import BonePrior
+from snarfcli.deformer import BonePrior
 from snarfcli.errors import UserError
 from snarfcli.samples.preprocessing import preprocess_subject
 from snarfcli.samples.store import SampleStore

@@ -1,4 +1,4 @@
-"""The searches and their gradient as torch.library operators with autograd, fake kernels and per-device implementations.
+"""The searches as torch.library operators with autograd, fake kernels and per-device implementations.
 
 An operator does not check its arguments; `find_correspondences` does. The default kernel of each is the readable reference in
 PyTorch, for every type of device. CPU and CUDA tensors have native kernels as well, chosen by the argument `backend`. The
@@ -7,30 +7,26 @@ gradient is the implicit one of SNARF Eq. 14.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import torch
 from torch import Tensor
-from torch._library.custom_ops import CustomOpDef
 
-from snarfcli.deformer.blending import raise_for_second_derivative
 from snarfcli.deformer.broyden import broyden_roots
 from snarfcli.deformer.complete import complete_roots
-from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.deformer.implicit import implicit_backward
+from snarfcli.deformer.operators import grid_of, register_native
 from snarfcli.deformer.roots import Roots
 from snarfcli.native import cpu, cuda
 from snarfcli.native.backend import choose_backend
 from snarfcli.native.capacity import fit_to_capacity
 
 __all__ = [
-    "add_implicit_gradient",
     "broyden_search",
     "broyden_search_reference",
     "complete_search",
     "complete_search_reference",
-    "implicit_backward",
-    "implicit_backward_reference",
 ]
 
 Results = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -87,7 +83,7 @@ def complete_search_reference(
     capacity: int | None,
 ) -> Results:
     """The readable version of `complete_search`."""
-    grid, nodes = _grid(lower, upper, shape)
+    grid, nodes = grid_of(lower, upper, shape)
     metres = tolerance * grid.longest_side
     with torch.autocast(points.device.type, enabled=False):
         roots = complete_roots(
@@ -141,7 +137,7 @@ def broyden_search_reference(
     capacity: int | None,
 ) -> Results:
     """The readable version of `broyden_search`."""
-    grid, nodes = _grid(lower, upper, shape)
+    grid, nodes = grid_of(lower, upper, shape)
     with torch.autocast(points.device.type, enabled=False):
         roots = broyden_roots(
             points,
@@ -157,121 +153,11 @@ def broyden_search_reference(
     return fit_to_capacity(*_reference_result(roots, orientation_preserving), points, capacity)
 
 
-# ---------------------------------------------------------------- gradient of both
-@torch.library.custom_op("snarf::implicit_backward", mutates_args=())
-def implicit_backward(
-    gradient: Tensor,
-    canonical: Tensor,
-    query: Tensor,
-    jacobian_inverse: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    shape: Sequence[int],
-    batch: int,
-    count: int,
-    wants_points: bool,
-    wants_transforms: bool,
-    backend: str,
-) -> tuple[Tensor, Tensor]:
-    """Return the gradients of a loss by the queries [B, N, 3] and by the transforms [B, D * H * W, 12]; empty if not wanted.
-
-    Args:
-        gradient: [M, 3], of the loss by the roots.
-        canonical, query, jacobian_inverse: as the search returned them.
-
-    Source: SNARF Eq. 14.
-    """
-    choose_backend(backend, gradient.device.type)  # as above
-    roots = (gradient, canonical, query, jacobian_inverse)
-    return implicit_backward_reference(*roots, lower, upper, shape, batch, count, wants_points, wants_transforms)
-
-
-def implicit_backward_reference(
-    gradient: Tensor,
-    canonical: Tensor,
-    query: Tensor,
-    jacobian_inverse: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    shape: Sequence[int],
-    batch: int,
-    count: int,
-    wants_points: bool,
-    wants_transforms: bool,
-    into: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """The readable version of `implicit_backward`; with `into` the gradient by the transforms is added to that tensor.
-
-    With g the gradient by x*, implicit differentiation gives v = J^-T g for the query, and -v outer [x*; 1], weighted
-    trilinearly, for each of the eight nodes of the root's cell.
-    """
-    grid, nodes = _grid(lower, upper, shape)
-    known = (query < batch * count).nonzero()[:, 0]
-    gradient, canonical, query = gradient[known], canonical[known], query[known]
-    v = (jacobian_inverse[known] * gradient[:, :, None]).sum(1)
-    v_points, v_transforms = gradient.new_empty(0), gradient.new_empty(0)
-    if wants_points:
-        v_points = gradient.new_zeros(batch * count, 3).index_add(0, query, v).reshape(batch, count, 3)
-    if wants_transforms:
-        per_pose = nodes[0] * nodes[1] * nodes[2]
-        cell, local = locate(canonical, grid, nodes)
-        at = cell_corners(cell, nodes) + (query // max(count, 1) * per_pose)[:, None]
-        homogeneous = torch.cat([canonical, torch.ones_like(canonical[:, :1])], 1)
-        v_blended = -(v[:, :, None] * homogeneous[:, None]).reshape(-1, 12)
-        v_corners = trilinear_weights(local)[..., None] * v_blended[:, None]
-        v_transforms = gradient.new_zeros(batch, per_pose, 12) if into is None else into
-        v_transforms.view(-1, 12).index_add_(0, at.reshape(-1), v_corners.reshape(-1, 12))
-    return v_points, v_transforms
-
-
-def add_implicit_gradient(
-    into: Tensor | None,
-    gradient: Tensor,
-    canonical: Tensor,
-    query: Tensor,
-    jacobian_inverse: Tensor,
-    lower: Tensor,
-    upper: Tensor,
-    shape: Sequence[int],
-    batch: int,
-    count: int,
-    wants_points: bool,
-    backend: str,
-) -> Tensor:
-    """Add the gradient of a loss by the transforms to `into` [B, D * H * W, 12], unless that is None.
-
-    Otherwise as `implicit_backward`.
-
-    Returns:
-        The gradient by the queries, [B, N, 3]; empty if not wanted.
-    """
-    device = gradient.device.type
-    native = {"cpu": cpu.implicit_backward, "cuda": cuda.implicit_backward}.get(device, implicit_backward_reference)
-    run = native if choose_backend(backend, device) == "native" else implicit_backward_reference
-    roots = (gradient, canonical, query, jacobian_inverse)
-    return run(*roots, lower, upper, shape, batch, count, wants_points, into is not None, into)[0]
-
-
 # ---------------------------------------------------------------- native kernels
-def _register_native(operator: CustomOpDef, device_type: str, native: Callable, reference: Callable) -> None:
-    """Register `native` for one type of device, replaced by `reference` depending on the last argument, `backend`."""
-
-    @operator.register_kernel(device_type)
-    def kernel(*arguments):
-        *given, backend = arguments
-        return (native if choose_backend(backend, device_type) == "native" else reference)(*given)
-
-
-_register_native(complete_search, "cpu", cpu.complete_search, complete_search_reference)
-_register_native(complete_search, "cuda", cuda.complete_search, complete_search_reference)
-_register_native(broyden_search, "cpu", cpu.broyden_search, broyden_search_reference)
-_register_native(broyden_search, "cuda", cuda.broyden_search, broyden_search_reference)
-_register_native(implicit_backward, "cpu", cpu.implicit_backward, implicit_backward_reference)
-_register_native(implicit_backward, "cuda", cuda.implicit_backward, implicit_backward_reference)
-
-
-def _grid(lower: Tensor, upper: Tensor, shape: Sequence[int]) -> tuple[CanonicalGrid, tuple[int, int, int]]:
-    return CanonicalGrid(lower, upper, checked=True), (shape[0], shape[1], shape[2])
+register_native(complete_search, "cpu", cpu.complete_search, complete_search_reference)
+register_native(complete_search, "cuda", cuda.complete_search, complete_search_reference)
+register_native(broyden_search, "cpu", cpu.broyden_search, broyden_search_reference)
+register_native(broyden_search, "cuda", cuda.broyden_search, broyden_search_reference)
 
 
 def _reference_result(roots: Roots, orientation_preserving: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -295,13 +181,6 @@ def _(points, transforms, lower, upper, shape, active_cells, tolerance, max_step
 @broyden_search.register_fake
 def _(points, transforms, starts, lower, upper, shape, tolerance, divergence, max_steps, exact, preserving, capacity, backend):
     return _fake_roots(points, capacity)
-
-
-@implicit_backward.register_fake
-def _(gradient, canonical, query, inverse, lower, upper, shape, batch, count, wants_points, wants_transforms, backend):
-    nodes = shape[0] * shape[1] * shape[2]
-    v_points = gradient.new_empty((batch, count, 3) if wants_points else 0)
-    return v_points, gradient.new_empty((batch, nodes, 12) if wants_transforms else 0)
 
 
 # ---------------------------------------------------------------- gradients
@@ -330,4 +209,3 @@ def _backward(ctx, gradient, *_):
 
 for _operator, _lower in ((complete_search, 2), (broyden_search, 3)):
     _operator.register_autograd(_backward, setup_context=partial(_save_for_backward, lower=_lower))
-implicit_backward.register_autograd(raise_for_second_derivative)

@@ -18,7 +18,7 @@ from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.forward_maps import ForwardMap, map_in_cells, map_on_field
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
 from snarfcli.deformer.grid_search import BlendedPoses, check_capacity, check_points
-from snarfcli.deformer.ops import add_implicit_gradient
+from snarfcli.deformer.implicit import add_implicit_gradient
 from snarfcli.deformer.pose_gradients import PoseGradients, corners_of_poses
 from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.starts import check_starts

@@ -242,7 +242,7 @@ def implicit_backward(
     wants_transforms: bool,
     into: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return the gradients by the queries and by the transforms; see `ops.implicit_backward`."""
+    """Return the gradients by the queries and by the transforms; see `implicit.implicit_backward`."""
     gradient, canonical = gradient.contiguous(), canonical.contiguous()
     query, jacobian_inverse = query.contiguous(), jacobian_inverse.contiguous()
     v_points = gradient.new_zeros((batch, count, 3) if wants_points else 0)

@@ -78,7 +78,7 @@ def implicit_backward(
     wants_transforms: bool,
     into: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Return the gradients by the queries and by the transforms; see `ops.implicit_backward`.
+    """Return the gradients by the queries and by the transforms; see `implicit.implicit_backward`.
 
     The first is deterministic. The second is summed by atomics in an order that varies, and so do its last bits.
     """

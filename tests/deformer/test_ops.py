@@ -8,7 +8,8 @@ from skinning_scenes import random_transforms, scene, smooth_weights, unit_grid
 
 from snarfcli.deformer import SearchConfig, blend_transforms, find_correspondences
 from snarfcli.deformer.blending import blend, blend_backward
-from snarfcli.deformer.ops import broyden_search, complete_search, implicit_backward, implicit_backward_reference
+from snarfcli.deformer.implicit import implicit_backward, implicit_backward_reference
+from snarfcli.deformer.ops import broyden_search, complete_search
 from snarfcli.native import cpu
 
 SHAPE = (6, 7, 8)

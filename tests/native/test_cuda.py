@@ -18,6 +18,7 @@ from snarfcli.deformer import (
     SkinningConfig,
     cells_near,
     find_correspondences,
+    implicit,
     ops,
 )
 from snarfcli.deformer.skinning import blend_transforms
@@ -120,10 +121,11 @@ def test_constants_are_those_of_the_headers():
 
 
 def test_functions_take_what_the_operators_take():
-    for name in ("complete_search", "broyden_search", "implicit_backward"):
-        schema = getattr(ops, name)._opoverload._schema
-        for function in (getattr(cuda, name), getattr(cpu, name), getattr(ops, f"{name}_reference")):
-            assert [argument.name for argument in schema.arguments] == [*inspect.signature(function).parameters, "backend"]
+    for room, name in ((ops, "complete_search"), (ops, "broyden_search"), (implicit, "implicit_backward")):
+        schema = getattr(room, name)._opoverload._schema
+        for function in (getattr(cuda, name), getattr(cpu, name), getattr(room, f"{name}_reference")):
+            taken = [parameter for parameter in inspect.signature(function).parameters if parameter != "into"]
+            assert [argument.name for argument in schema.arguments] == [*taken, "backend"]
 
 
 # ---------------------------------------------------------------- searching
@@ -413,7 +415,7 @@ def test_gradient_equals_the_reference(runner, dtype, block):
     roots = (gradient, canonical, query, inverse)
     if runner.device == "emulated":
         runner.block = block
-    wanted = ops.implicit_backward_reference(*roots, grid.lower, grid.upper, SHAPE, 3, 60, True, True)
+    wanted = implicit.implicit_backward_reference(*roots, grid.lower, grid.upper, SHAPE, 3, 60, True, True)
     found = runner(cuda_launches.run_backward, *roots, grid.lower, grid.upper, SHAPE, 3, 60, True, True)
     for mine, theirs in zip(found, wanted, strict=True):
         rounding = 1e-5 if dtype == torch.float32 else 1e-13

@@ -211,7 +211,7 @@ class ForwardDeformer(FieldOnGrid):
             if not self._sums_to_one:
                 check_values(self.grid, bone_transforms, weights.values, cells)
             poses = BlendedPoses.of(bone_transforms, weights.values, self.grid, self.search, cells)
-            if cells is None or bool(cells.all()):
+            if cells is None or self.searches_all_cells:
                 return PosedGrid(bone_transforms, poses, lambda: poses)
             return PosedGrid(bone_transforms, poses, lambda: self._blended_everywhere(bone_transforms))
 

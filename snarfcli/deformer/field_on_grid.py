@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from snarfcli.deformer.callables import takes_pose, with_pose
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.deformer.roots import is_costly_to_read
 from snarfcli.deformer.variation import total_variation
 from snarfcli.deformer.weights import GridWeights, NetworkWeights, NodeWeights, WeightField
 
@@ -40,6 +41,8 @@ class FieldOnGrid(nn.Module):
     _active_points: Tensor
     _frozen: Tensor | None
     field: Callable[..., Tensor]
+    searches_all_cells: bool
+    """Whether all cells are active."""
 
     def __init__(
         self,
@@ -194,7 +197,10 @@ class FieldOnGrid(nn.Module):
         corners = cell_corners(cell, self.shape)
         if self.takes_pose:
             corners = corners + nodes * self._known(pose_index)[:, None]
-        used, place = corners.unique(return_inverse=True)
+        if is_costly_to_read(corners):  # finding the different ones would wait for a GPU
+            used, place = corners.reshape(-1), torch.arange(corners.numel(), device=corners.device).reshape(corners.shape)
+        else:
+            used, place = corners.unique(return_inverse=True)
         if isinstance(self.field, GridWeights):
             weights = self._checked(self.field.at_nodes(used), len(used))
         else:
@@ -247,6 +253,7 @@ class FieldOnGrid(nn.Module):
 
     def _update_active_nodes(self) -> None:
         """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
+        self.searches_all_cells = bool(self.active_cells.all())
         self._used_nodes = corners_of(self.active_cells)
         self._active_nodes = self._used_nodes.reshape(-1).nonzero()[:, 0]
         self._active_points = self.grid.nodes(self.shape).reshape(-1, 3)[self._active_nodes]

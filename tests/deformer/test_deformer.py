@@ -18,8 +18,10 @@ from snarfcli.deformer import (
     SkinningConfig,
     centring,
     correspondences,
+    field_on_grid,
     find_correspondences,
     grid_search,
+    posed,
 )
 from snarfcli.deformer.skinning_config import FIELDS
 
@@ -208,8 +210,9 @@ class Operators(TorchDispatchMode):
 @pytest.mark.parametrize("name", ["distilled", "voxel", "preset"])
 def test_a_search_with_a_capacity_waits_for_nothing(name, monkeypatch):
     """On a GPU, where values are not checked: sizes that depend on data, and numbers read from tensors, would wait."""
-    for reader in (grid_search, centring):
+    for reader in (grid_search, centring, field_on_grid):
         monkeypatch.setattr(reader, "is_costly_to_read", lambda tensor: True)
+    monkeypatch.setattr(posed, "choose_backend", lambda *_: "reference")  # cells are prepared on the CPU only
     monkeypatch.setattr(correspondences, "_reading_waits", lambda tensor: True)
     module, other = deformer(name), deformer(name, seed=1)
     cells = torch.ones(5, 6, 7, dtype=torch.bool)
@@ -223,10 +226,17 @@ def test_a_search_with_a_capacity_waits_for_nothing(name, monkeypatch):
         with Operators() as called:
             found = one(points, transforms, capacity=100)
             gather_everything(found)
+            prepared = one.pose(transforms)
+            again = prepared(points, capacity=100)
+            prepared.skin(points, normals=points)
+            prepared.transforms_at(points)
+            one.skin(points, transforms, directions=points)
+            one.skinning_weights(points[0])
         assert "snarf::complete_search" in called.names
         waiting = ("aten::nonzero", "aten::_local_scalar_dense", "aten::masked_select", "aten::unique")
         assert not [name for name in called.names if name.startswith(waiting)]
         assert torch.equal(found.canonical[: len(wanted.query)], wanted.canonical)
+        assert torch.equal(again.canonical, found.canonical)
 
 
 @pytest.mark.parametrize("name", FIELDS)

@@ -184,6 +184,7 @@ class ForwardDeformer(FieldOnGrid):
                 check=not self._sums_to_one,
             )
 
+    @torch.compiler.disable  # pointers of the native library; what the poses do can be compiled
     def pose(self, bone_transforms: Tensor, weights: NodeWeights | None = None) -> PosedDeformer:
         """Prepare poses for many calls: the transforms are blended, and the cells sorted, once.
 

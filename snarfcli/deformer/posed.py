@@ -232,7 +232,11 @@ class PosedGrid(PosedDeformer):
         x = poses.centred.starts(canonical)
         cell, local = locate(x, poses.centred.grid, poses.shape)
         first = nodes * torch.arange(len(x), device=x.device)[:, None, None]
-        corners = corners_of_poses(self._all_nodes.gradients, (cell_corners(cell, poses.shape) + first).reshape(-1, 8))
+        at_corners = (cell_corners(cell, poses.shape) + first).reshape(-1, 8)
+        if torch.compiler.is_compiling():  # as in a search
+            corners = self._all_nodes.poses.transforms.reshape(-1, 12)[at_corners]
+        else:
+            corners = corners_of_poses(self._all_nodes.gradients, at_corners)
         at = map_in_cells(corners.reshape(*x.shape[:2], 8, 12), local, x, size, with_jacobian)
         return at.restored(poses.centred)
 

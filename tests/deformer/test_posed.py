@@ -425,3 +425,28 @@ def test_a_field_may_depend_on_the_pose(name):
         nodes = deformer.node_weights(poses=2)
         assert nodes.values.shape == (2, *SHAPE, 3)
         assert_same(find_correspondences(points, transforms, nodes.values, unit_grid(), search=search), found)
+
+
+def test_what_a_pose_does_can_be_compiled():
+    """In one graph; preparing the pose is left to Python."""
+    points, transforms, weights = scene(torch.float64, angle=0.2)
+    points.requires_grad_()
+    deformer = deformer_of(weights)
+
+    def work(posed, points):
+        found = posed(points, capacity=120)
+        skinned, normals = posed.skin(points, normals=points)
+        return found.canonical.square().sum() + (skinned * normals).sum() + posed.transforms_at(points).sin().sum()
+
+    def whole(points):
+        return work(deformer.pose(transforms), points)
+
+    posed = deformer.pose(transforms)
+    compiled = torch.compile(lambda points: work(posed, points), fullgraph=True, backend="aot_eager")
+    inputs = (points, deformer.field.values)
+    wanted, *gradients = [whole(points), *torch.autograd.grad(whole(points), inputs)]
+    for function in (compiled, torch.compile(whole, backend="aot_eager")):
+        value = function(points)
+        torch.testing.assert_close(value, wanted)
+        for mine, theirs in zip(torch.autograd.grad(value, inputs, retain_graph=True), gradients, strict=True):
+            torch.testing.assert_close(mine, theirs)

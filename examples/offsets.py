@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from snarf import ForwardDeformer, builtin_body, skin
-from snarf.deformer import CanonicalBody, Correspondences, find_correspondences_on_map
+from snarf import Correspondences, ForwardDeformer, builtin_body, find_correspondences_on_map, skin
+from snarf.deformer import CanonicalBody
 
 POSES = 6
 POINTS = 250  # per pose and step

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from snarf import Body, CanonicalGrid, ForwardDeformer, Skeleton, SkinningConfig, builtin_body, skin
-from snarf.deformer import PresetWeights, WeightField, cells_near
+from snarf import Body, CanonicalGrid, ForwardDeformer, PresetWeights, Skeleton, SkinningConfig, builtin_body, skin
+from snarf.deformer import WeightField, cells_near
 
 SUBJECTS = 3
 NODES = (12, 48, 40)  # of the grid, along z, y, x

@@ -1,4 +1,4 @@
-"""What all examples have in common: they need PyTorch and NumPy only, and have tests."""
+"""What all examples have in common: they need PyTorch and NumPy only, and the documentation names them."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ def test_they_import_without_extras():
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_each_has_a_test_and_says_how_to_run_it(path):
+def test_each_has_a_test_and_is_named_in_the_documentation(path):
     assert (ROOT / "tests/examples" / f"test_{path.name}").is_file()
+    assert f"examples/{path.name}" in (ROOT / "docs/library.md").read_text()
     assert f"python examples/{path.name}" in path.read_text()

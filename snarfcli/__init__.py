@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         SkinningConfig,
         find_correspondences,
         find_correspondences_on_field,
+        find_correspondences_on_map,
         skin,
     )
     from snarfcli.errors import UserError
@@ -47,6 +48,7 @@ __all__ = [
     "builtin_body",
     "find_correspondences",
     "find_correspondences_on_field",
+    "find_correspondences_on_map",
     "load_body",
     "skin",
 ]
@@ -63,6 +65,7 @@ _HOMES = {
         "SkinningConfig",
         "find_correspondences",
         "find_correspondences_on_field",
+        "find_correspondences_on_map",
         "skin",
     ),
     "errors": ("UserError",),

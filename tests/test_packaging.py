@@ -129,7 +129,7 @@ def test_the_source_distribution_builds(tmp_path):
     (archive,) = tmp_path.glob("snarf-*.tar.gz")
     with tarfile.open(archive) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
-    folders = ("csrc", "conf", "snarf", "snarfcli", "tests")
+    folders = ("csrc", "conf", "examples", "snarf", "snarfcli", "tests")
     wanted = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
     wanted = {path.relative_to(ROOT).as_posix() for path in wanted if "__pycache__" not in path.parts}
     assert wanted | {"CMakeLists.txt", "pyproject.toml", "README.md", "LICENSE", "Makefile", "tools/set_up.sh"} <= names

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Any
 
 import torch
+from documents import python_examples, run_examples
 
 README = Path(__file__).parents[1] / "README.md"
 
 
-def python_examples() -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", README.read_text(), re.MULTILINE | re.DOTALL)
-
-
 def test_the_examples_of_the_deformer_run():
-    examples = [text for text in python_examples() if "ForwardDeformer" in text]
+    examples = [text for text in python_examples(README) if "ForwardDeformer" in text]
     assert len(examples) == 2
-    names: dict[str, Any] = {}
     torch.manual_seed(0)
-    for text in examples:
-        exec(compile(text, README.name, "exec"), names)
+    names = run_examples(README, examples)
     assert names["posed_values"].shape == (1, 1000)
     inside = names["posed_values"] > -0.1
     assert 10 < int(inside.sum()) < 500
@@ -29,6 +22,6 @@ def test_the_examples_of_the_deformer_run():
 
 
 def test_every_example_is_python():
-    assert len(python_examples()) >= 4
-    for text in python_examples():
+    assert len(python_examples(README)) >= 4
+    for text in python_examples(README):
         compile(text, README.name, "exec")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from snarfcli.deformer.callables import with_pose
 from snarfcli.deformer.centring import Centred
-from snarfcli.deformer.skinning import blended_matrices, moved_vectors, trilinear_transforms
+from snarfcli.deformer.skinning import between_corners, blended_matrices, moved_vectors, trilinear_transforms
 
 __all__ = ["ForwardMap", "map_by_weights", "map_in_cells", "map_on_field"]
 
@@ -59,16 +59,15 @@ def map_in_cells(
         with_jacobian: whether the Jacobian is computed.
     """
     inside = local.clamp(0, 1)
-    blended, *by_local = trilinear_transforms(corner_transforms.reshape(-1, 8, 12), inside.reshape(-1, 3))
-    rows = blended.reshape(*canonical.shape[:2], 3, 4)
-    jacobian = None
-    if with_jacobian:
-        varies = (local == inside) / cell_size
-        columns = [
-            _applied(part.reshape(rows.shape), canonical) * varies[..., axis, None] for axis, part in enumerate(by_local)
-        ]
-        jacobian = rows[..., :3] + torch.stack(columns, -1)
-    return ForwardMap(rows, _applied(rows, canonical), jacobian)
+    corners = corner_transforms.reshape(-1, 8, 12), inside.reshape(-1, 3)
+    shape = [*canonical.shape[:2], 3, 4]
+    if not with_jacobian:
+        rows = between_corners(*corners).reshape(shape)
+        return ForwardMap(rows, _applied(rows, canonical), None)
+    rows, *by_local = (part.reshape(shape) for part in trilinear_transforms(*corners))
+    varies = (local == inside) / cell_size
+    columns = [_applied(part, canonical) * varies[..., axis, None] for axis, part in enumerate(by_local)]
+    return ForwardMap(rows, _applied(rows, canonical), rows[..., :3] + torch.stack(columns, -1))
 
 
 def map_by_weights(weights: Tensor, canonical: Tensor, bone_transforms: Tensor) -> ForwardMap:

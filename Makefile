@@ -69,6 +69,7 @@ format: $(INSTALLED)
 bench: export OMP_WAIT_POLICY = PASSIVE
 bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_search.py
+	$(VENV)/bin/python benchmarks/bm_library.py
 	$(VENV)/bin/python benchmarks/bm_data.py
 	$(VENV)/bin/python benchmarks/bm_training.py
 	$(VENV)/bin/python benchmarks/bm_evaluation.py

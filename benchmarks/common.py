@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import ctypes
+import gc
+import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
@@ -14,7 +19,17 @@ import torch
 
 from snarfcli.runs import machine_facts
 
-__all__ = ["arguments", "in_pytorch", "median_and_spread", "print_machine", "print_table", "timed"]
+__all__ = [
+    "Times",
+    "arguments",
+    "in_pytorch",
+    "in_turns",
+    "median_and_spread",
+    "print_machine",
+    "print_table",
+    "resident_bytes",
+    "timed",
+]
 
 
 def arguments(description: str, **extra: dict) -> argparse.Namespace:
@@ -48,6 +63,39 @@ def timed(work: Callable[[], object], repeats: int) -> list[float]:
     return seconds
 
 
+@dataclass
+class Times:
+    """Medians of repeated calls, seconds."""
+
+    wall: float
+    """Elapsed time."""
+    processor: float
+    """Processor time of all threads, which other processes lengthen less."""
+
+    def scaled(self, factor: float) -> Times:
+        """Return the times of `factor` as many calls."""
+        return Times(self.wall * factor, self.processor * factor)
+
+    def over(self, other: Times) -> str:
+        """Return the ratios of these times to others, elapsed and, in brackets, processor time."""
+        return f"{self.wall / other.wall:.3g} ({self.processor / other.processor:.3g})"
+
+
+def in_turns(works: Sequence[Callable[[], object]], repeats: int) -> list[Times]:
+    """Return the times of several works, called one after the other again and again, after a warm-up call of each."""
+    for work in works:
+        work()
+    wall: list[list[float]] = [[] for _ in works]
+    processor: list[list[float]] = [[] for _ in works]
+    for _ in range(repeats):
+        for i, work in enumerate(works):
+            start, used = time.perf_counter(), time.process_time()
+            work()
+            wall[i].append(time.perf_counter() - start)
+            processor[i].append(time.process_time() - used)
+    return [Times(statistics.median(a), statistics.median(b)) for a, b in zip(wall, processor, strict=True)]
+
+
 @contextmanager
 def in_pytorch() -> Iterator[None]:
     """Evaluate networks layer by layer in PyTorch instead of natively."""
@@ -61,6 +109,14 @@ def median_and_spread(seconds: Sequence[float]) -> str:
     """Return median, minimum and maximum in milliseconds."""
     ms = [1000 * value for value in seconds]
     return f"{statistics.median(ms):.1f} ({min(ms):.1f}-{max(ms):.1f})"
+
+
+def resident_bytes() -> int:
+    """Return the memory of this process, after it returned to the system what it does not use."""
+    gc.collect()
+    with contextlib.suppress(AttributeError):  # not in every C library
+        ctypes.CDLL(None).malloc_trim(0)
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def print_machine() -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import gc
 import json
 import os
 import statistics
@@ -15,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from common import median_and_spread
+from common import median_and_spread, resident_bytes
 from scenes import QUERY_KINDS, Scene, body_scene
 from searches import Method, as_found, methods
 from torch import Tensor
@@ -62,19 +59,16 @@ def _probe(request: str) -> None:
     active = scene.near_cells if cells == "near" else None
     points, transforms = scene.queries(kind, count)[None].contiguous(), scene.transforms[None]
     method.run(points[:, :1000], transforms, scene, active)
-    gc.collect()
-    with contextlib.suppress(AttributeError):  # not in every C library
-        ctypes.CDLL(None).malloc_trim(0)
+    before = resident_bytes()
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far (man 5 proc)
-    before = _status("VmRSS")
     result = method.run(points, transforms, scene, active)
-    print(json.dumps({"bytes": _status("VmHWM") - before, "roots": len(as_found(result).query)}))
+    print(json.dumps({"bytes": _peak_bytes() - before, "roots": len(as_found(result).query)}))
 
 
-def _status(name: str) -> int:
-    """Return a size in /proc/self/status, bytes."""
+def _peak_bytes() -> int:
+    """Return the largest memory of this process since the peak was forgotten."""
     lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * int(next(line for line in lines if line.startswith(name)).split()[1])
+    return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
 
 
 def training_rows(chosen: list[Method], resolution: tuple[int, int, int], repeats: int) -> list[list[str]]:

@@ -20,7 +20,7 @@ if ! "$venv/bin/python" -c 'import torch' 2>/dev/null; then
         $pip install --quiet 'torch==2.13.0+cpu' 2>/dev/null ||
             $pip install --quiet 'torch==2.13.0' --index-url https://download.pytorch.org/whl/cpu
     else
-        $pip install --quiet 'torch>=2.4'
+        $pip install --quiet 'torch>=2.5'
     fi
 fi
 $pip install --quiet --editable '.[test]'

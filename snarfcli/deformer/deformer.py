@@ -14,7 +14,7 @@ from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.field_on_grid import FieldOnGrid
 from snarfcli.deformer.field_search import find_correspondences_on_field
-from snarfcli.deformer.forward_maps import ForwardMap, map_in_cells, map_on_field
+from snarfcli.deformer.forward_maps import ForwardMap, map_by_weights, map_in_cells, map_on_field
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.grid_search import BlendedPoses, check_points, check_transforms, check_values, find_correspondences
 from snarfcli.deformer.hierarchy import make_softmax
@@ -296,6 +296,9 @@ class ForwardDeformer(FieldOnGrid):
             if self.searches_field:
                 return map_on_field(self.field, canonical, bone_transforms, with_jacobian)
             pose = torch.arange(batch, device=canonical.device).repeat_interleave(count)
+            if not with_jacobian:  # without corners, in a fifth of the time
+                weights = self.skinning_weights(canonical.reshape(-1, 3), pose_index=pose)
+                return map_by_weights(weights.reshape(batch, count, -1), canonical, bone_transforms)
             corners, local = self.corner_weights(canonical.reshape(-1, 3), pose)
             transforms = blend_transforms(corners.reshape(batch, 1, count, 8, -1), bone_transforms)
             transforms = transforms.reshape(batch, count, 8, 12)

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from snarfcli.deformer.callables import with_pose
 from snarfcli.deformer.centring import Centred
-from snarfcli.deformer.skinning import blended_matrices, moved_vectors, trilinear_transforms
+from snarfcli.deformer.skinning import between_corners, blended_matrices, moved_vectors, trilinear_transforms
 
-__all__ = ["ForwardMap", "map_in_cells", "map_on_field"]
+__all__ = ["ForwardMap", "map_by_weights", "map_in_cells", "map_on_field"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,16 +59,21 @@ def map_in_cells(
         with_jacobian: whether the Jacobian is computed.
     """
     inside = local.clamp(0, 1)
-    blended, *by_local = trilinear_transforms(corner_transforms.reshape(-1, 8, 12), inside.reshape(-1, 3))
-    rows = blended.reshape(*canonical.shape[:2], 3, 4)
-    jacobian = None
-    if with_jacobian:
-        varies = (local == inside) / cell_size
-        columns = [
-            _applied(part.reshape(rows.shape), canonical) * varies[..., axis, None] for axis, part in enumerate(by_local)
-        ]
-        jacobian = rows[..., :3] + torch.stack(columns, -1)
-    return ForwardMap(rows, _applied(rows, canonical), jacobian)
+    corners = corner_transforms.reshape(-1, 8, 12), inside.reshape(-1, 3)
+    shape = [*canonical.shape[:2], 3, 4]
+    if not with_jacobian:
+        rows = between_corners(*corners).reshape(shape)
+        return ForwardMap(rows, _applied(rows, canonical), None)
+    rows, *by_local = (part.reshape(shape) for part in trilinear_transforms(*corners))
+    varies = (local == inside) / cell_size
+    columns = [_applied(part, canonical) * varies[..., axis, None] for axis, part in enumerate(by_local)]
+    return ForwardMap(rows, _applied(rows, canonical), rows[..., :3] + torch.stack(columns, -1))
+
+
+def map_by_weights(weights: Tensor, canonical: Tensor, bone_transforms: Tensor) -> ForwardMap:
+    """Evaluate the map without its Jacobian, for weights [B, N, J] at the points [B, N, 3]."""
+    rows = blended_matrices(weights, bone_transforms)[..., :3, :]
+    return ForwardMap(rows, _applied(rows, canonical), None)
 
 
 def map_on_field(field: Callable[..., Tensor], canonical: Tensor, bone_transforms: Tensor, with_jacobian: bool) -> ForwardMap:
@@ -90,14 +95,13 @@ def map_on_field(field: Callable[..., Tensor], canonical: Tensor, bone_transform
             wanted = [batch * count, bone_transforms.shape[1]]
             raise ValueError(f"field: wanted weights of shape {wanted}, got {list(weights.shape)}")
         weights = weights.reshape(batch, count, -1).to(canonical.dtype)
-        rows = blended_matrices(weights, bone_transforms)[..., :3, :]
-        posed = _applied(rows, x)
+        at = map_by_weights(weights, x, bone_transforms)
         if not with_jacobian:
-            return ForwardMap(rows, posed, None)
+            return at
         rows_of_jacobian = [
-            torch.autograd.grad(part.sum(), x, create_graph=is_recorded, retain_graph=True)[0] for part in posed.unbind(-1)
+            torch.autograd.grad(part.sum(), x, create_graph=is_recorded, retain_graph=True)[0] for part in at.posed.unbind(-1)
         ]
-        parts = rows, posed, torch.stack(rows_of_jacobian, -2)
+        parts = at.rows, at.posed, torch.stack(rows_of_jacobian, -2)
     return ForwardMap(*(parts if is_recorded else (part.detach() for part in parts)))
 
 

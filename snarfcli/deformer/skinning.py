@@ -14,6 +14,7 @@ from snarfcli.networks import MAX_FEATURES, run_encoding
 from snarfcli.precision import matmul_precision
 
 __all__ = [
+    "between_corners",
     "blend_transforms",
     "blended_matrices",
     "forward_jacobian",
@@ -276,6 +277,14 @@ def forward_jacobian(corner_transforms: Tensor, local: Tensor, origin: Tensor, c
     moved = torch.bmm(stacked, homogeneous[:, :, None]).reshape(-1, 4, 3)  # T x, then dT/du_i x
     jacobian = moved[:, 1:].transpose(1, 2) + stacked[:, :3, :3] * cell_size
     return moved[:, 0], jacobian
+
+
+def between_corners(values: Tensor, local: Tensor) -> Tensor:
+    """Interpolate values [M, 8, C] at the corners of grid cells, at cell coordinates [M, 3]; returns [M, C]."""
+    u, v, w = (coordinate[:, None] for coordinate in local.unbind(1))
+    at_w = torch.lerp(values[:, :4], values[:, 4:], w[..., None])
+    at_v = torch.lerp(at_w[:, :2], at_w[:, 2:], v[..., None])
+    return torch.lerp(at_v[:, 0], at_v[:, 1], u)
 
 
 def trilinear_transforms(corner_transforms: Tensor, local: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

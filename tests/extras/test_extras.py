@@ -56,16 +56,19 @@ assert not set(left) & {{name.partition(".")[0] for name in sys.modules}}
 
 def test_every_module_works_or_says_what_to_install():
     code = """
-import importlib, pkgutil, snarfcli
+import importlib, pathlib, snarfcli
 from snarfcli.extras import MissingPackage
 
-for module in pkgutil.walk_packages(snarfcli.__path__, "snarfcli.", onerror=lambda name: None):
+# not `pkgutil.walk_packages`: the native library looks like a module, and an editable installation has other folders too
+folder = pathlib.Path(snarfcli.__file__).parent
+for path in sorted(folder.rglob("*.py")):
+    name = ".".join(["snarfcli", *path.relative_to(folder).with_suffix("").parts]).removesuffix(".__init__")
     try:
-        importlib.import_module(module.name)
+        importlib.import_module(name)
     except MissingPackage:
-        print(module.name.split(".")[1])
-    except ModuleNotFoundError as error:
-        if not module.name.startswith("snarfcli.formats.") and not module.name.endswith("blender_job"):
+        print(name.split(".")[1])
+    except ModuleNotFoundError:
+        if not name.startswith("snarfcli.formats.") and not name.endswith("blender_job"):
             raise
 """
     done = run_light(code)

@@ -88,16 +88,20 @@ class PairSearch {
   }
 
  private:
+  struct Taken {
+    const CellPair* pairs;
+    int count;
+  };
+
   struct List {
     CellPair pairs[9 * width];  // those that are left, fewer than `width`, and what one step adds
     int count = 0;
     void push(const CellPair& pair) { pairs[count++] = pair; }
-    // Moves up to `width` pairs from the end to the caller, and returns how many.
-    int take(const CellPair*& first) {
+    // Hands over up to `width` pairs from the end. They stay valid until something is pushed.
+    Taken take() {
       const int taken = count < width ? count : width;
       count -= taken;
-      first = pairs + count;
-      return taken;
+      return {pairs + count, taken};
     }
   };
 
@@ -169,17 +173,19 @@ class PairSearch {
       level < kLevels ? cut(level) : solve_from_many_starts();
       if (level < kLevels) settle(level + 1, width);
     }
-    const CellPair* pairs;
     while (tame_[level].count >= least) {
+      const Taken taken = tame_[level].take();
       Parts parts;
-      load(pairs, tame_[level].take(pairs), level, parts);
-      solve(parts, pairs, kAffineStart);
+      load(taken, level, parts);
+      solve(parts, taken.pairs, kAffineStart);
     }
   }
 
   // Loads the parts of pairs, which lie `level` cuts deep in their cells. Lanes without a pair repeat the first.
-  void load(const CellPair* pairs, int count, int level, Parts& out) const {
+  void load(const Taken& taken, int level, Parts& out) const {
     const Geometry<S>& geometry = task_.geometry;
+    const CellPair* const pairs = taken.pairs;
+    const int count = taken.count;
     const S* nodes[width];
     S centre[3][width], points[3][width];
     for (int k = 0; k < width; ++k) {
@@ -225,9 +231,9 @@ class PairSearch {
 
   // Cuts the parts of some pairs into eight, and keeps those that may hold a root of the query.
   void cut(int level) {
-    const CellPair* pairs;
+    const Taken taken = open_[level].take();
     Parts whole;
-    load(pairs, open_[level].take(pairs), level, whole);
+    load(taken, level, whole);
     const S wide = S(0.5) + face_tolerance<S>() * S(2) / whole.scale;
     for (uint32_t eighth = 0; eighth < 8; ++eighth) {
       Cell<V> cell;
@@ -241,7 +247,7 @@ class PairSearch {
       const uint32_t is_tame = bits(bounds.curvature < S(kTame));
       for (uint32_t left = bits(may); left; left &= left - 1) {
         const int lane = lowest_bit(left);
-        CellPair pair = pairs[lane];
+        CellPair pair = taken.pairs[lane];
         pair.path |= eighth << 3 * level;
         (is_tame >> lane & 1 ? tame_ : open_)[level + 1].push(pair);
       }
@@ -249,10 +255,10 @@ class PairSearch {
   }
 
   void solve_from_many_starts() {
-    const CellPair* pairs;
+    const Taken taken = open_[kLevels].take();
     Parts parts;
-    load(pairs, open_[kLevels].take(pairs), kLevels, parts);
-    for (int start = 0; start < kStarts; ++start) solve(parts, pairs, start);
+    load(taken, kLevels, parts);
+    for (int start = 0; start < kStarts; ++start) solve(parts, taken.pairs, start);
   }
 
   // Newton's method from one of kStarts.

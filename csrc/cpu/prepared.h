@@ -17,6 +17,7 @@
 #include <cstring>
 #include <limits>
 #include <memory>
+#include <new>
 #include <vector>
 
 #include "bins.h"
@@ -182,17 +183,20 @@ template <class S>
 void sort_cells(SortedCells<S>& out) {
   lay_out_bins(out);
   PreparedPose<S>& pose = out.pose;
-  std::vector<int32_t> next(size_t(pose.bins), 0);  // number of cells of each bin, then place of its next one
+  std::vector<int64_t> next(size_t(pose.bins), 0);  // number of cells of each bin, then place of its next one
   each_cell(out, [&](int32_t, const TouchedBins& touched) {
     pose.level[touched.level].is_empty = false;
     touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t*) { ++next[bin]; });
   });
   out.first.assign(size_t(pose.bins + 1), 0);
+  pose.groups = 0;
   for (int64_t bin = 0; bin < pose.bins; ++bin) {
-    out.first[bin + 1] = out.first[bin] + (next[bin] + kBlock - 1) / kBlock;
-    next[bin] = out.first[bin] * kBlock;
+    const int64_t groups = (next[bin] + kBlock - 1) / kBlock;
+    next[bin] = pose.groups * kBlock;
+    pose.groups += groups;
+    if (pose.groups > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // 340 GB of groups
+    out.first[bin + 1] = int32_t(pose.groups);
   }
-  pose.groups = out.first[pose.bins];
   out.groups.resize(size_t(pose.groups));
   for (BinGroup& group : out.groups) {
     std::memset(group.lower, 255, sizeof group.lower);
@@ -201,9 +205,9 @@ void sort_cells(SortedCells<S>& out) {
   }
   each_cell(out, [&](int32_t cell, const TouchedBins& touched) {
     touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t* at) {
-      const int32_t place = next[bin]++;
+      const int64_t place = next[bin]++;
       BinGroup& group = out.groups[place / kBlock];
-      const int k = place % kBlock;
+      const int k = int(place % kBlock);
       for (int i = 0; i < 3; ++i) {
         group.lower[i][k] = touched.lower_in(at[i], i);
         group.upper[i][k] = touched.upper_in(at[i], i);

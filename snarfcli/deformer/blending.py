@@ -5,11 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from snarfcli.deformer.second_derivatives import raise_for_second_derivative
 from snarfcli.native import cpu
 from snarfcli.native.backend import choose_backend
 from snarfcli.precision import matmul_precision
 
-__all__ = ["blend", "blend_backward", "raise_for_second_derivative"]
+__all__ = ["blend", "blend_backward"]
 
 
 @torch.library.custom_op("snarf::blend", mutates_args=())
@@ -102,14 +103,6 @@ def _backward(ctx, gradient):
     wants = ctx.needs_input_grad[0], ctx.needs_input_grad[1]
     v_weights, v_bones = blend_backward(gradient, *ctx.saved_tensors, *wants, ctx.backend)
     return v_weights if wants[0] else None, v_bones if wants[1] else None, None, None
-
-
-def raise_for_second_derivative(ctx, *gradients):
-    """Raise RuntimeError: the gradient of a gradient operator."""
-    raise RuntimeError(
-        "the second derivative of a correspondence search is not available: its gradient is exact, but is itself computed "
-        "without a graph; call backward() or autograd.grad() without create_graph=True"
-    )
 
 
 blend.register_autograd(_backward, setup_context=_save_for_backward)

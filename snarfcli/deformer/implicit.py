@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from snarfcli.deformer.blending import raise_for_second_derivative
 from snarfcli.deformer.grid import cell_corners, locate, trilinear_weights
 from snarfcli.deformer.operators import grid_of, register_native
+from snarfcli.deformer.second_derivatives import raise_for_second_derivative
 from snarfcli.native import cpu, cuda
 from snarfcli.native.backend import choose_backend
 

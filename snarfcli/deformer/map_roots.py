@@ -14,6 +14,7 @@ from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.grid import CanonicalGrid
 from snarfcli.deformer.inference_tensors import NormalTensors
 from snarfcli.deformer.search_config import SearchConfig
+from snarfcli.deformer.second_derivatives import differentiable_once
 from snarfcli.precision import matmul_precision
 
 __all__ = ["MapSettings", "PosedMap", "search_map"]
@@ -231,13 +232,14 @@ class _ImplicitRoots(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, posed, queries, canonical, jacobian_inverse):
-        ctx.save_for_backward(jacobian_inverse)
-        return canonical.clone()
+        roots = canonical.clone()
+        ctx.save_for_backward(jacobian_inverse, roots)  # the roots, since J^-1 depends on them
+        return roots
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @differentiable_once
     def backward(ctx, gradient):
-        (jacobian_inverse,) = ctx.saved_tensors
+        jacobian_inverse, _ = ctx.saved_tensors
         with matmul_precision("highest"):
             pulled = torch.bmm(jacobian_inverse.transpose(1, 2), gradient[:, :, None])[:, :, 0]
         return -pulled, pulled, None, None

@@ -12,7 +12,8 @@ import threading
 import torch
 from torch import Tensor
 from torch.autograd import Variable
-from torch.autograd.function import once_differentiable
+
+from snarfcli.deformer.second_derivatives import differentiable_once
 
 __all__ = ["PoseGradients", "corners_of_poses"]
 
@@ -65,7 +66,7 @@ class _Ticket(torch.autograd.Function):
         return transforms.new_zeros(())
 
     @staticmethod
-    @once_differentiable
+    @differentiable_once
     def backward(ctx, gradient):
         return ctx.sums.take(torch._C._current_graph_task_id()), None
 
@@ -83,7 +84,7 @@ class _Corners(torch.autograd.Function):
         return gradients.transforms.reshape(-1, 12).index_select(0, nodes.reshape(-1)).reshape(*nodes.shape, 12)
 
     @staticmethod
-    @once_differentiable
+    @differentiable_once
     def backward(ctx, gradient):
         (nodes,) = ctx.saved_tensors
         ctx.gradients.sum().view(-1, 12).index_add_(0, nodes.reshape(-1), gradient.reshape(-1, 12))

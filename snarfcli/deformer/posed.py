@@ -10,7 +10,6 @@ from typing import Any, overload
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.correspondences import Correspondences
@@ -21,6 +20,7 @@ from snarfcli.deformer.grid_search import BlendedPoses, check_capacity, check_po
 from snarfcli.deformer.implicit import add_implicit_gradient
 from snarfcli.deformer.pose_gradients import PoseGradients, corners_of_poses
 from snarfcli.deformer.search_config import SearchConfig
+from snarfcli.deformer.second_derivatives import differentiable_once
 from snarfcli.deformer.starts import check_starts
 from snarfcli.native import cpu
 from snarfcli.native.backend import choose_backend
@@ -263,7 +263,7 @@ class _Roots(torch.autograd.Function):
         return found
 
     @staticmethod
-    @once_differentiable
+    @differentiable_once
     def backward(ctx, gradient, *_):
         if gradient is None:
             return (None,) * 5

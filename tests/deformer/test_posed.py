@@ -251,13 +251,32 @@ def test_passes_do_not_disturb_each_other():
     assert not posed._searched.gradients._sums._by_pass
 
 
-def test_a_loss_that_needs_a_second_derivative_is_refused():
+@pytest.mark.parametrize("loss", [lambda roots: roots.square().sum(), lambda roots: roots.sum()])
+def test_a_loss_that_needs_a_second_derivative_is_refused(loss):
+    """Also where only the inverse Jacobian depends on the points and weights."""
     points, transforms, weights = scene(torch.float64, angle=0.2)
     points.requires_grad_()
-    found = deformer_of(weights).pose(transforms)(points)
-    (gradient,) = torch.autograd.grad(found.canonical.square().sum(), points, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.sum().backward()
+    deformer = deformer_of(weights)
+    inputs = (points, deformer.field.values)
+    for found in (deformer(points, transforms), deformer.pose(transforms)(points)):
+        for gradient in torch.autograd.grad(loss(found.canonical), inputs, create_graph=True):
+            with pytest.raises(RuntimeError, match="second derivative of a correspondence search is not available"):
+                gradient.sum().backward(retain_graph=True)
+
+
+def test_gradients_of_skinning_can_be_differentiated():
+    """Those by the points; a loss on them, as on a Jacobian, has the gradient by the weights."""
+    points, transforms, weights = scene(torch.float64, angle=0.2)
+    x = (0.5 * points).requires_grad_()
+    deformer = deformer_of(weights)
+    wanted, mine = (
+        torch.autograd.grad(
+            torch.autograd.grad(skin(x).square().sum(), x, create_graph=True)[0].square().sum(), (x, deformer.field.values)
+        )
+        for skin in (lambda x: deformer.skin(x, transforms), deformer.pose(transforms).skin)
+    )
+    for one, other in zip(mine, wanted, strict=True):
+        torch.testing.assert_close(one, other)
 
 
 def test_no_gradient_is_tracked_without_need():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import overload
+from typing import TypeVar, overload
 
 import torch
 from torch import Tensor
@@ -25,6 +25,13 @@ from snarfcli.deformer.skinning_config import FIELDS, SkinningConfig
 from snarfcli.deformer.weights import NetworkWeights, NodeWeights, VoxelWeights, WeightField
 
 __all__ = ["ForwardDeformer"]
+
+Function = TypeVar("Function", bound=Callable[..., object])
+
+
+def _left_to_python(function: Function) -> Function:
+    """Keep a function out of what torch.compile compiles."""
+    return torch.compiler.disable(function)  # pyright: ignore[reportReturnType]
 
 
 class ForwardDeformer(FieldOnGrid):
@@ -184,7 +191,7 @@ class ForwardDeformer(FieldOnGrid):
                 check=not self._sums_to_one,
             )
 
-    @torch.compiler.disable  # pointers of the native library; what the poses do can be compiled
+    @_left_to_python
     def pose(self, bone_transforms: Tensor, weights: NodeWeights | None = None) -> PosedDeformer:
         """Prepare poses for many calls: the transforms are blended, and the cells sorted, once.
 

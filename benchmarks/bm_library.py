@@ -41,7 +41,7 @@ def main() -> None:
     )
     torch.set_num_threads(options.threads or 2)
     print_machine()
-    print(f"{torch.get_num_threads()} threads; load {', '.join(f'{load:.1f}' for load in os.getloadavg())} in 1, 5, 15 minutes")
+    print(f"{torch.get_num_threads()} threads; load of the machine {os.getloadavg()[1]:.1f} before")
     works: dict[str, Callable[[], None]] = {
         "chunks": lambda: _chunks(options.points, options.chunk, options.part, options.repeats),
         "frozen": lambda: _frozen(options.repeats),
@@ -51,6 +51,7 @@ def main() -> None:
     }
     for name in options.only.split(","):
         works[name]()
+    print(f"\nLoad of the machine with this benchmark {os.getloadavg()[1]:.1f}")
 
 
 # ---------------------------------------------------------------- scenes

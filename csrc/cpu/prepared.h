@@ -320,36 +320,44 @@ PreparedTask<S> task_of(const char* buffer, const snarf_field& field, int64_t po
   return task;
 }
 
+// Each thread takes some queries at a time and finds all their roots, so that it can sort them at once.
 template <class S>
 void prepared_search(const char* buffer, const snarf_field& field, const snarf_queries& queries, const snarf_complete& settings,
                      RootsOf<S>& out) {
   const S distance = S(kSameRoot) * smallest_side(geometry_of<S>(field));
   const int64_t total = queries.poses * queries.count;
   for (int64_t begin = 0; begin < total; begin += kGroupQueries) {
-    const int64_t count = std::min(kGroupQueries, total - begin);
+    const int64_t count = std::min(kGroupQueries, total - begin), parts = (count + kQueriesAtOnce - 1) / kQueriesAtOnce;
     const int threads = threads_for(queries, count);
     std::unique_ptr<Group<S>> group(new Group<S>());
     group->first_query = begin;
-    group->lists.resize(threads);
-    Queue queue(count, kQueriesAtOnce);
-    Collect<S> collect(*group, count, threads, distance);
-    std::vector<std::function<void(int)>> phases;
-    phases.push_back([&](int thread) {
-      group->lists[thread].reset(new RootList<S>());
-      for (int64_t first, end; queue.take(first, end);)
-        for (int64_t last; first < end; first = last) {
-          const int64_t pose = (begin + first) / queries.count;
-          last = std::min(end, (pose + 1) * queries.count - begin);
-          PreparedTask<S> task = task_of<S>(buffer, field, pose);
-          task.points = static_cast<const S*>(queries.points) + 3 * begin;
-          task.tolerance = S(settings.tolerance);
-          task.max_steps = settings.max_steps;
-          task.orientation_preserving = settings.orientation_preserving != 0;
-          kernels<S>().search_prepared(task, first, last, group->lists[thread]->sink());
-        }
-    });
-    collect.add_to(phases);
-    if (!run_phases(threads, phases)) throw std::bad_alloc();
+    group->lists.resize(size_t(parts));
+    std::vector<std::vector<const Root<S>*>> sorted(static_cast<size_t>(parts));
+    Queue queue(parts, 1);
+    const auto search = [&](int64_t part) {
+      std::unique_ptr<RootList<S>>& list = group->lists[part];
+      list.reset(new RootList<S>());
+      const int64_t start = part * kQueriesAtOnce, end = std::min(count, start + kQueriesAtOnce);
+      for (int64_t first = start, last; first < end; first = last) {
+        const int64_t pose = (begin + first) / queries.count;
+        last = std::min(end, (pose + 1) * queries.count - begin);
+        PreparedTask<S> task = task_of<S>(buffer, field, pose);
+        task.points = static_cast<const S*>(queries.points) + 3 * begin;
+        task.tolerance = S(settings.tolerance);
+        task.max_steps = settings.max_steps;
+        task.orientation_preserving = settings.orientation_preserving != 0;
+        kernels<S>().search_prepared(task, first, last, list->sink());
+      }
+      sorted[part] = sorted_roots(*list, start, end, distance);
+    };
+    const bool well = run_phases(threads, {[&](int) {
+                                   for (int64_t part, next; queue.take(part, next);) search(part);
+                                 }});
+    if (!well) throw std::bad_alloc();
+    for (const auto& part : sorted) group->count += int64_t(part.size());
+    group->sorted.reset(new const Root<S>*[group->count]);
+    const Root<S>** to = group->sorted.get();
+    for (const auto& part : sorted) to = std::copy(part.begin(), part.end(), to);
     out.groups.push_back(std::move(group));
   }
 }

@@ -133,6 +133,36 @@ bool same_root(const Root<S>& a, const Root<S>& b, S distance) {
   return square < distance * distance && (determinant(a.inverse) > 0) == (determinant(b.inverse) > 0);
 }
 
+// Sorts the roots at to end of one query and moves those that differ to `kept`; returns the end of them.
+template <class S>
+int64_t keep_different(const Root<S>** roots, int64_t at, int64_t end, int64_t kept, S distance) {
+  std::sort(roots + at, roots + end, comes_before<S>);
+  const int64_t first = kept;
+  for (; at < end; ++at) {
+    bool is_new = true;
+    for (int64_t k = first; k < kept; ++k) is_new &= !same_root(*roots[k], *roots[at], distance);
+    if (is_new) roots[kept++] = roots[at];
+  }
+  return kept;
+}
+
+// The roots in a list that has all those of the queries first to last: sorted by query, without duplicates.
+template <class S>
+std::vector<const Root<S>*> sorted_roots(RootList<S>& list, int64_t first, int64_t last, S distance) {
+  std::vector<int32_t> begin(size_t(last - first + 1), 0);
+  list.each([&](const Root<S>& root) { ++begin[root.query - first + 1]; });
+  for (int64_t q = 0; q < last - first; ++q) begin[q + 1] += begin[q];
+  std::vector<const Root<S>*> roots(size_t(begin.back()));
+  list.each([&](const Root<S>& root) { roots[begin[root.query - first]++] = &root; });  // begin[q] becomes the end of q
+  int64_t kept = 0, at = 0;
+  for (int64_t q = 0; q < last - first; ++q) {
+    kept = keep_different(roots.data(), at, int64_t(begin[q]), kept, distance);
+    at = begin[q];
+  }
+  roots.resize(size_t(kept));
+  return roots;
+}
+
 // Phases that sort the lists' roots by query and drop duplicates.
 template <class S>
 class Collect {
@@ -175,13 +205,8 @@ class Collect {
           roots[kept++] = roots[at++];
           continue;
         }
-        std::sort(roots + at, roots + end, comes_before<S>);
-        const int64_t mine = kept;
-        for (; at < end; ++at) {
-          bool is_new = true;
-          for (int64_t k = mine; k < kept; ++k) is_new &= !same_root(*roots[k], *roots[at], distance_);
-          if (is_new) roots[kept++] = roots[at];
-        }
+        kept = keep_different(roots, at, end, kept, distance_);
+        at = end;
       }
       kept_[thread] = kept - start;
     });

@@ -184,7 +184,6 @@ class ForwardDeformer(FieldOnGrid):
                 check=not self._sums_to_one,
             )
 
-    @torch.compiler.disable  # pointers of the native library; what the poses do can be compiled
     def pose(self, bone_transforms: Tensor, weights: NodeWeights | None = None) -> PosedDeformer:
         """Prepare poses for many calls: the transforms are blended, and the cells sorted, once.
 
@@ -198,6 +197,12 @@ class ForwardDeformer(FieldOnGrid):
         Raises:
             ValueError, TypeError: as `find_correspondences`.
         """
+        if torch.compiler.is_compiling():  # not as a decorator, which would import the compiler: two seconds
+            return torch.compiler.disable(self._pose)(bone_transforms, weights)  # pyright: ignore[reportCallIssue]
+        return self._pose(bone_transforms, weights)
+
+    def _pose(self, bone_transforms: Tensor, weights: NodeWeights | None) -> PosedDeformer:
+        """As `pose`. Not to be compiled: pointers of the native library; what the poses do can be compiled."""
         self._check_poses(bone_transforms)
         check_search_config(self.search, self.num_bones)
         with torch.autocast(bone_transforms.device.type, enabled=False):

@@ -67,6 +67,10 @@ class ForwardDeformer(FieldOnGrid):
         skinning = skinning or SkinningConfig()
         if skinning.name not in FIELDS:
             raise ValueError(f"skinning.name: wanted {', '.join(FIELDS[:-1])} or {FIELDS[-1]}, got {skinning.name!r}")
+        if len(skinning.resolution) != 3 or min(skinning.resolution) < 2:
+            raise ValueError(f"skinning.resolution: wanted three numbers of at least 2, got {list(skinning.resolution)}")
+        if field is not None and not callable(field):
+            raise TypeError(f"field: wanted a function of canonical points, got a {type(field).__name__}")
         width, height, depth = skinning.resolution
         shape = (depth, height, width)
         if field is None:
@@ -122,6 +126,7 @@ class ForwardDeformer(FieldOnGrid):
 
     @search.setter
     def search(self, search: SearchConfig) -> None:
+        check_search_config(search, self.num_bones)
         if self.searches_field and search.name != "broyden":
             raise ValueError(
                 f"search.name: wanted broyden for skinning.name 'mlp', got {search.name!r}: the field has no cells"
@@ -334,6 +339,9 @@ class ForwardDeformer(FieldOnGrid):
             bone_transforms: [J, 4, 4], canonical to posed.
             cells: [D-1, H-1, W-1], bool, at least one.
         """
+        if bone_transforms.ndim != 3:
+            raise ValueError(f"bone_transforms: wanted [{self.num_bones}, 4, 4], one pose, got {list(bone_transforms.shape)}")
+        self._check_poses(bone_transforms[None])
         lower, upper = self._box_of_nodes(bone_transforms[None], cells)
         return lower[0].cpu(), upper[0].cpu()
 

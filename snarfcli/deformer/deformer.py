@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar, overload
+from typing import overload
 
 import torch
 from torch import Tensor
@@ -25,13 +25,6 @@ from snarfcli.deformer.skinning_config import FIELDS, SkinningConfig
 from snarfcli.deformer.weights import NetworkWeights, NodeWeights, VoxelWeights, WeightField
 
 __all__ = ["ForwardDeformer"]
-
-Function = TypeVar("Function", bound=Callable[..., object])
-
-
-def _left_to_python(function: Function) -> Function:
-    """Keep a function out of what torch.compile compiles."""
-    return torch.compiler.disable(function)  # pyright: ignore[reportReturnType]
 
 
 class ForwardDeformer(FieldOnGrid):
@@ -74,6 +67,10 @@ class ForwardDeformer(FieldOnGrid):
         skinning = skinning or SkinningConfig()
         if skinning.name not in FIELDS:
             raise ValueError(f"skinning.name: wanted {', '.join(FIELDS[:-1])} or {FIELDS[-1]}, got {skinning.name!r}")
+        if len(skinning.resolution) != 3 or min(skinning.resolution) < 2:
+            raise ValueError(f"skinning.resolution: wanted three numbers of at least 2, got {list(skinning.resolution)}")
+        if field is not None and not callable(field):
+            raise TypeError(f"field: wanted a function of canonical points, got a {type(field).__name__}")
         width, height, depth = skinning.resolution
         shape = (depth, height, width)
         if field is None:
@@ -129,6 +126,7 @@ class ForwardDeformer(FieldOnGrid):
 
     @search.setter
     def search(self, search: SearchConfig) -> None:
+        check_search_config(search, self.num_bones)
         if self.searches_field and search.name != "broyden":
             raise ValueError(
                 f"search.name: wanted broyden for skinning.name 'mlp', got {search.name!r}: the field has no cells"
@@ -191,7 +189,6 @@ class ForwardDeformer(FieldOnGrid):
                 check=not self._sums_to_one,
             )
 
-    @_left_to_python
     def pose(self, bone_transforms: Tensor, weights: NodeWeights | None = None) -> PosedDeformer:
         """Prepare poses for many calls: the transforms are blended, and the cells sorted, once.
 
@@ -205,6 +202,12 @@ class ForwardDeformer(FieldOnGrid):
         Raises:
             ValueError, TypeError: as `find_correspondences`.
         """
+        if torch.compiler.is_compiling():  # not as a decorator, which would import the compiler: two seconds
+            return torch.compiler.disable(self._pose)(bone_transforms, weights)  # pyright: ignore[reportCallIssue]
+        return self._pose(bone_transforms, weights)
+
+    def _pose(self, bone_transforms: Tensor, weights: NodeWeights | None) -> PosedDeformer:
+        """As `pose`. Not to be compiled: pointers of the native library; what the poses do can be compiled."""
         self._check_poses(bone_transforms)
         check_search_config(self.search, self.num_bones)
         with torch.autocast(bone_transforms.device.type, enabled=False):
@@ -336,6 +339,9 @@ class ForwardDeformer(FieldOnGrid):
             bone_transforms: [J, 4, 4], canonical to posed.
             cells: [D-1, H-1, W-1], bool, at least one.
         """
+        if bone_transforms.ndim != 3:
+            raise ValueError(f"bone_transforms: wanted [{self.num_bones}, 4, 4], one pose, got {list(bone_transforms.shape)}")
+        self._check_poses(bone_transforms[None])
         lower, upper = self._box_of_nodes(bone_transforms[None], cells)
         return lower[0].cpu(), upper[0].cpu()
 

@@ -36,6 +36,8 @@ class PresetWeights(GridWeights):
     weights: Tensor
 
     def __init__(self, grid: CanonicalGrid, weights: Tensor) -> None:
+        if weights.ndim != 4:
+            raise ValueError(f"weights: wanted shape [D, H, W, J], got {list(weights.shape)}")
         depth, height, width = weights.shape[:3]
         super().__init__(grid, (depth, height, width))
         self.register_buffer("weights", weights.detach().reshape(-1, weights.shape[-1]).clone())

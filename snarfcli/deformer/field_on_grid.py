@@ -164,26 +164,35 @@ class FieldOnGrid(nn.Module):
     def skinning_weights(
         self, canonical: Tensor, weights: NodeWeights | None = None, pose_index: Tensor | None = None
     ) -> Tensor:
-        """Return the skinning weights [N, J] at canonical points [N, 3], as the search uses them; differentiable.
+        """Return the skinning weights [..., J] at canonical points [..., 3], as the search uses them; differentiable.
 
         Only the nodes around the points are evaluated, if they are few. The weights are exact also under autocast.
 
         Args:
-            canonical: [N, 3], metres; points outside the grid get the weights of its border.
+            canonical: [..., 3], metres; points outside the grid get the weights of its border.
             weights: from `node_weights`, if they have been evaluated already; the points must then lie in cells whose nodes
                 were evaluated.
-            pose_index: [N], the pose of each point, for weights that differ from pose to pose.
+            pose_index: [...], the pose of each point, for weights that differ from pose to pose.
         """
-        canonical = canonical.to(self.lower.dtype)
+        if not canonical.ndim or canonical.shape[-1] != 3:
+            raise ValueError(f"canonical: wanted shape [..., 3], got {list(canonical.shape)}")
+        leading = canonical.shape[:-1]
+        if pose_index is not None and pose_index.shape != leading:
+            raise ValueError(f"pose_index: wanted shape {list(leading)} to fit canonical, got {list(pose_index.shape)}")
+        points = canonical.to(self.lower.dtype).reshape(-1, 3)
         with torch.autocast(canonical.device.type, enabled=False):
-            if self.searches_field:
-                return self._at_points(canonical, pose_index)
-            if weights is None and self._frozen is not None:
-                weights = NodeWeights(self._frozen, self.grid)
-            if weights is not None:
-                return weights.at(canonical, pose_index)
-            corners, local = self.corner_weights(canonical, pose_index)
-            return (trilinear_weights(local.clamp(0, 1))[..., None] * corners).sum(-2)
+            at = self._weights_at(points, weights, None if pose_index is None else pose_index.reshape(-1))
+        return at.reshape(*leading, self.num_bones)
+
+    def _weights_at(self, points: Tensor, weights: NodeWeights | None, pose_index: Tensor | None) -> Tensor:
+        if self.searches_field:
+            return self._at_points(points, pose_index)
+        if weights is None and self._frozen is not None:
+            weights = NodeWeights(self._frozen, self.grid)
+        if weights is not None:
+            return weights.at(points, pose_index)
+        corners, local = self.corner_weights(points, pose_index)
+        return (trilinear_weights(local.clamp(0, 1))[..., None] * corners).sum(-2)
 
     def corner_weights(self, canonical: Tensor, pose_index: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the weights [N, 8, J] at the corners of each point's cell, and its coordinates [N, 3] in the cell.

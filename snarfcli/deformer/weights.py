@@ -54,6 +54,8 @@ class NodeWeights:
             canonical: [N, 3], metres; points outside the box get the weights of its border.
             pose_index: [N], the pose of each point, for weights that differ from pose to pose.
         """
+        if canonical.ndim != 2 or canonical.shape[1] != 3:
+            raise ValueError(f"canonical: wanted shape [N, 3], got {list(canonical.shape)}")
         if self.values.ndim == 4:
             return interpolate(self.values, canonical, self.grid)
         corners, local = self.corners(canonical, pose_index)

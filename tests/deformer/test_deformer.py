@@ -270,6 +270,15 @@ def test_what_does_not_go_together_is_rejected():
         ForwardDeformer(grid, BONES, settings("preset"))
     changed = settings("preset")
     changed.resolution = [9, 7, 6]
+    with pytest.raises(TypeError, match="field: wanted a function of canonical points, got a str"):
+        ForwardDeformer(grid, BONES, field="mlp")
+    for resolution in ([4, 4], [4, 1, 4]):
+        with pytest.raises(ValueError, match=r"skinning.resolution: wanted three numbers of at least 2, got \[4"):
+            ForwardDeformer(grid, BONES, SkinningConfig(resolution=resolution))
+    with pytest.raises(ValueError, match=r"search.name: wanted complete or broyden, got 'brodyen'"):
+        ForwardDeformer(grid, BONES, search="brodyen")
+    with pytest.raises(ValueError, match=r"weights: wanted shape \[D, H, W, J\], got \[4, 4, 4\]"):
+        PresetWeights(grid, torch.ones(4, 4, 4))
     with pytest.raises(ValueError, match=r"field: wanted the grid's nodes \[6, 7, 9\] .* got \[6, 7, 8\]"):
         ForwardDeformer(grid, BONES, changed, field=preset(grid))
     with pytest.raises(ValueError, match=r"search.name: wanted broyden for skinning.name 'mlp', got 'complete'"):
@@ -277,6 +286,8 @@ def test_what_does_not_go_together_is_rejected():
     module = deformer("mlp")
     with pytest.raises(ValueError, match=r"search.name: wanted broyden for skinning.name 'mlp'"):
         module.search = SearchConfig("complete")
+    with pytest.raises(ValueError, match=r"bone_transforms: wanted \[3, 4, 4\], one pose, got \[2, 3, 4, 4\]"):
+        module.posed_box(torch.eye(4).expand(2, BONES, 4, 4), module.active_cells)
     with pytest.raises(ValueError, match=r"active_cells: wanted bool \[5, 6, 7\], got torch.float32 \[5, 6, 7\]"):
         module.set_active_cells(torch.ones(5, 6, 7))
     with pytest.raises(ValueError, match="active_cells: wanted at least one cell, got none"):

@@ -61,6 +61,41 @@ def test_few_points_have_the_weights_of_the_whole_grid(name):
     assert deformer.skinning_weights(x[:0]).shape == (0, 3)
 
 
+@pytest.mark.parametrize("frozen", [False, True])
+@pytest.mark.parametrize("gradients", [False, True])
+@pytest.mark.parametrize("name", ["distilled", "voxel", "preset", "mlp"])
+def test_points_of_any_leading_shape(name, gradients, frozen):
+    deformer = make(name)
+    if frozen and name != "mlp":
+        deformer.freeze()
+    x = points(30)
+    with torch.set_grad_enabled(gradients):
+        flat = deformer.skinning_weights(x)
+        torch.testing.assert_close(deformer.skinning_weights(x.reshape(2, 3, 5, 3)), flat.reshape(2, 3, 5, 3))
+        torch.testing.assert_close(deformer.skinning_weights(x[0]), flat[0])
+
+
+def test_points_of_any_leading_shape_with_weights_of_each_pose():
+    def field(x, pose_index):
+        return (x * (1 + pose_index[:, None])).softmax(1)
+
+    deformer = make("distilled", field=field)
+    x, pose = points(30), torch.arange(30) % 3
+    flat = deformer.skinning_weights(x, pose_index=pose)
+    shaped = deformer.skinning_weights(x.reshape(2, 15, 3), pose_index=pose.reshape(2, 15))
+    torch.testing.assert_close(shaped.reshape(30, 3), flat)
+
+
+def test_points_and_poses_that_do_not_fit_are_named():
+    deformer = make("voxel")
+    with pytest.raises(ValueError, match=r"canonical: wanted shape \[\.\.\., 3\], got \[5, 2\]"):
+        deformer.skinning_weights(points(5)[:, :2])
+    with pytest.raises(ValueError, match=r"pose_index: wanted shape \[5\] to fit canonical, got \[4\]"):
+        deformer.skinning_weights(points(5), pose_index=torch.zeros(4, dtype=torch.long))
+    with pytest.raises(ValueError, match=r"canonical: wanted shape \[N, 3\], got \[1, 5, 3\]"):
+        deformer.node_weights().at(points(5)[None])
+
+
 def test_only_nodes_around_the_points_are_evaluated():
     field = Counted()
     deformer = make("distilled", field=field)

@@ -3,37 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import overload
 
 import torch
 from torch import Tensor
 
 from snarfcli.deformer.bone_prior import BonePrior
 from snarfcli.deformer.canonical_body import CanonicalBody, canonical_body, weights_around
-from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.correspondences import Correspondences
-from snarfcli.deformer.field_on_grid import FieldOnGrid
+from snarfcli.deformer.diffusion import PresetWeights
 from snarfcli.deformer.field_search import find_correspondences_on_field
-from snarfcli.deformer.forward_maps import ForwardMap, map_by_weights, map_in_cells, map_on_field
+from snarfcli.deformer.forward_skinning import ForwardSkinning
 from snarfcli.deformer.grid import CanonicalGrid
-from snarfcli.deformer.grid_search import BlendedPoses, check_points, check_transforms, check_values, find_correspondences
+from snarfcli.deformer.grid_search import BlendedPoses, check_transforms, check_values, find_correspondences
 from snarfcli.deformer.hierarchy import make_softmax
 from snarfcli.deformer.posed import PosedDeformer, PosedField, PosedGrid
 from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
-from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.deformer.skinning_config import FIELDS, SkinningConfig
-from snarfcli.deformer.weights import NetworkWeights, NodeWeights, VoxelWeights, WeightField
+from snarfcli.deformer.weights import GridWeights, NetworkWeights, NodeWeights, VoxelWeights, WeightField
 
 __all__ = ["ForwardDeformer"]
 
 
-class ForwardDeformer(FieldOnGrid):
+class ForwardDeformer(ForwardSkinning):
     """Find the canonical correspondences of posed points under learned forward skinning.
 
     Args:
         grid: canonical box of the weight grid.
         num_bones: J, the number of bone transforms.
-        skinning: the weight field.
+        skinning: the weight field; None for the defaults, or for the nodes of a `field` that is defined at grid nodes.
         search: how correspondences are found; weights that are searched directly (skinning.name "mlp") need "broyden".
         active_cells: [D-1, H-1, W-1], bool, the cells that a complete search looks into (see `cells_near`); None for all.
         prior: weights that the field only corrects.
@@ -64,13 +61,16 @@ class ForwardDeformer(FieldOnGrid):
         field: Callable[..., Tensor] | None = None,
         mirror: Sequence[int] | None = None,
     ) -> None:
-        skinning = skinning or SkinningConfig()
+        if skinning is None:
+            skinning = _settings_of(field)
         if skinning.name not in FIELDS:
             raise ValueError(f"skinning.name: wanted {', '.join(FIELDS[:-1])} or {FIELDS[-1]}, got {skinning.name!r}")
         if len(skinning.resolution) != 3 or min(skinning.resolution) < 2:
             raise ValueError(f"skinning.resolution: wanted three numbers of at least 2, got {list(skinning.resolution)}")
         if field is not None and not callable(field):
             raise TypeError(f"field: wanted a function of canonical points, got a {type(field).__name__}")
+        if num_bones < 1:
+            raise ValueError(f"num_bones: wanted at least 1, got {num_bones}")
         width, height, depth = skinning.resolution
         shape = (depth, height, width)
         if field is None:
@@ -197,7 +197,8 @@ class ForwardDeformer(FieldOnGrid):
 
         Args:
             bone_transforms: [B, J, 4, 4], canonical to posed, metres, of the dtype and on the device of the deformer.
-            weights: from `node_weights`, if they have been evaluated already.
+            weights: from `node_weights`, if they have been evaluated already; `skin` and `transforms_at` of the poses then take
+                points in cells whose nodes were evaluated.
 
         Raises:
             ValueError, TypeError: as `find_correspondences`.
@@ -206,7 +207,7 @@ class ForwardDeformer(FieldOnGrid):
             return torch.compiler.disable(self._pose)(bone_transforms, weights)  # pyright: ignore[reportCallIssue]
         return self._pose(bone_transforms, weights)
 
-    def _pose(self, bone_transforms: Tensor, weights: NodeWeights | None) -> PosedDeformer:
+    def _pose(self, bone_transforms: Tensor, given: NodeWeights | None) -> PosedDeformer:
         """As `pose`. Not to be compiled: pointers of the native library; what the poses do can be compiled."""
         self._check_poses(bone_transforms)
         check_search_config(self.search, self.num_bones)
@@ -216,19 +217,19 @@ class ForwardDeformer(FieldOnGrid):
                 return PosedField(
                     bone_transforms, self.field, self.grid, self.search, lambda: self._box_of_nodes(bone_transforms)
                 )
-            if weights is None:
-                weights = self._searched_weights(len(bone_transforms))
+            weights = self._searched_weights(len(bone_transforms)) if given is None else given
             cells = None if self._searched_cells is None else self._searched_cells.clone()
             if not self._sums_to_one:
                 check_values(self.grid, bone_transforms, weights.values, cells)
             poses = BlendedPoses.of(bone_transforms, weights.values, self.grid, self.search, cells)
             if cells is None or self.searches_all_cells:
                 return PosedGrid(bone_transforms, poses, lambda: poses)
-            return PosedGrid(bone_transforms, poses, lambda: self._blended_everywhere(bone_transforms))
 
-    def _blended_everywhere(self, bone_transforms: Tensor) -> BlendedPoses:
-        weights = self.weight_grid(poses=len(bone_transforms))
-        return BlendedPoses.of(bone_transforms, weights, self.grid, self.search, None)
+            def everywhere() -> BlendedPoses:
+                values = self.weight_grid(poses=len(bone_transforms)) if given is None else given.values
+                return BlendedPoses.of(bone_transforms, values, self.grid, self.search, None)
+
+            return PosedGrid(bone_transforms, poses, everywhere)
 
     def _searched_weights(self, poses: int) -> NodeWeights:
         weights = self.node_weights(poses=poses)
@@ -243,113 +244,6 @@ class ForwardDeformer(FieldOnGrid):
     def _sums_to_one(self) -> bool:
         """Whether the weights are known to sum to 1, so that this need not be checked."""
         return isinstance(self.field, WeightField)
-
-    # ---------------------------------------------------------------- forward skinning
-    @overload
-    def skin(self, canonical: Tensor, bone_transforms: Tensor, *, directions: None = None, normals: None = None) -> Tensor: ...
-
-    @overload
-    def skin(
-        self, canonical: Tensor, bone_transforms: Tensor, *, directions: Tensor | None = None, normals: Tensor | None = None
-    ) -> Tensor | tuple[Tensor, ...]: ...
-
-    def skin(
-        self, canonical: Tensor, bone_transforms: Tensor, *, directions: Tensor | None = None, normals: Tensor | None = None
-    ) -> Tensor | tuple[Tensor, ...]:
-        """Move canonical points into poses: the inverse of the search, differentiable and exact also under autocast.
-
-        Args:
-            canonical: [B, N, 3], metres; or [N, 3] for one pose.
-            bone_transforms: [B, J, 4, 4], canonical to posed, metres; or [J, 4, 4].
-            directions: of the shape of `canonical`, a vector at each point, such as a tangent; moved by the exact Jacobian of
-                the deformation, which contains the derivative of the weights.
-            normals: of the shape of `canonical`, a normal at each point; moved by the inverse transpose of the Jacobian and
-                normalised.
-
-        Returns:
-            Posed points, of the shape of `canonical`, metres; with `directions` or `normals` a tuple of the points and of
-            these, in this order.
-
-        Raises:
-            ValueError, TypeError: a shape, dtype or device does not fit.
-
-        Source: SNARF Eq. 4.
-        """
-        for name, vectors in (("directions", directions), ("normals", normals)):
-            if vectors is not None and vectors.shape != canonical.shape:
-                raise ValueError(f"{name}: wanted the shape of the points, {list(canonical.shape)}, got {list(vectors.shape)}")
-        is_one = canonical.ndim == 2 and bone_transforms.ndim == 3
-        if is_one:
-            canonical, bone_transforms = canonical[None], bone_transforms[None]
-            directions, normals = (None if vectors is None else vectors[None] for vectors in (directions, normals))
-        with_jacobian = directions is not None or normals is not None
-        results = self._forward_map(canonical, bone_transforms, with_jacobian).skinned(directions, normals)
-        if not is_one:
-            return results
-        return results[0] if isinstance(results, Tensor) else tuple(result[0] for result in results)
-
-    def transforms_at(self, canonical: Tensor, bone_transforms: Tensor) -> Tensor:
-        """Return the blended transforms [B, N, 4, 4] at canonical points [B, N, 3], metres; differentiable.
-
-        Args:
-            canonical: [B, N, 3], metres.
-            bone_transforms: [B, J, 4, 4], canonical to posed, metres.
-        """
-        return self._forward_map(canonical, bone_transforms, with_jacobian=False).matrices()
-
-    def _forward_map(self, canonical: Tensor, bone_transforms: Tensor, with_jacobian: bool) -> ForwardMap:
-        self._check_poses(bone_transforms)
-        canonical = canonical.to(bone_transforms.dtype)
-        check_points(canonical, bone_transforms, "canonical")
-        batch, count = canonical.shape[:2]
-        with torch.autocast(canonical.device.type, enabled=False):
-            if self.searches_field:
-                return map_on_field(self.field, canonical, bone_transforms, with_jacobian)
-            pose = torch.arange(batch, device=canonical.device).repeat_interleave(count)
-            if not with_jacobian:  # without corners, in a fifth of the time
-                weights = self.skinning_weights(canonical.reshape(-1, 3), pose_index=pose)
-                return map_by_weights(weights.reshape(batch, count, -1), canonical, bone_transforms)
-            corners, local = self.corner_weights(canonical.reshape(-1, 3), pose)
-            transforms = blend_transforms(corners.reshape(batch, 1, count, 8, -1), bone_transforms)
-            transforms = transforms.reshape(batch, count, 8, 12)
-            size = self.grid.cell_size(self.shape)
-            return map_in_cells(transforms, local.reshape(batch, count, 3), canonical, size, with_jacobian)
-
-    def _check_poses(self, bone_transforms: Tensor) -> None:
-        """Raise ValueError or TypeError for transforms that are not [B, J, 4, 4] or do not fit the deformer."""
-        shape = list(bone_transforms.shape)
-        if len(shape) != 4 or shape[1:] != [self.num_bones, 4, 4]:
-            raise ValueError(f"bone_transforms: wanted shape [B, {self.num_bones}, 4, 4], got {shape}")
-        if bone_transforms.dtype != self.lower.dtype:
-            raise TypeError(
-                f"bone_transforms: wanted the dtype of the deformer, {self.lower.dtype}, got {bone_transforms.dtype}"
-            )
-        if bone_transforms.device != self.lower.device:
-            raise ValueError(
-                f"bone_transforms: wanted the device of the deformer, {self.lower.device}, got {bone_transforms.device}"
-            )
-
-    # ---------------------------------------------------------------- boxes
-    def posed_box(self, bone_transforms: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the corners (lower [3], upper [3]) of a box around the images of `cells` in one pose, metres.
-
-        It bounds the field that is trilinear between the nodes. A field that is searched directly may exceed it slightly.
-
-        Args:
-            bone_transforms: [J, 4, 4], canonical to posed.
-            cells: [D-1, H-1, W-1], bool, at least one.
-        """
-        if bone_transforms.ndim != 3:
-            raise ValueError(f"bone_transforms: wanted [{self.num_bones}, 4, 4], one pose, got {list(bone_transforms.shape)}")
-        self._check_poses(bone_transforms[None])
-        lower, upper = self._box_of_nodes(bone_transforms[None], cells)
-        return lower[0].cpu(), upper[0].cpu()
-
-    def _box_of_nodes(self, bone_transforms: Tensor, cells: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the corners, [B, 3] each, of boxes around the images of `cells`, or of the active cells if None."""
-        transforms = blend_transforms(self.weight_grid(poses=len(bone_transforms)), bone_transforms)
-        boxes = posed_boxes(transforms, self.grid, self.shape, self.active_cells if cells is None else cells)
-        return boxes[:, 0], boxes[:, 1]
 
 
 def _make_field(
@@ -368,3 +262,11 @@ def _make_field(
     if skinning.name == "voxel":
         return VoxelWeights(softmax, grid, shape, skinning.sharpness, prior, mirror)
     return NetworkWeights(softmax, grid, skinning.width, skinning.depth, skinning.sharpness, skinning.weight_norm, prior)
+
+
+def _settings_of(field: Callable[..., Tensor] | None) -> SkinningConfig:
+    """Return the settings for a field: those of its own nodes if it has some, otherwise the defaults."""
+    if not isinstance(field, GridWeights):
+        return SkinningConfig()
+    name = "preset" if isinstance(field, PresetWeights) else "voxel"
+    return SkinningConfig(name, resolution=list(field.shape[::-1]))

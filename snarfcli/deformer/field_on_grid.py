@@ -252,13 +252,17 @@ class FieldOnGrid(nn.Module):
         Raises:
             ValueError: the shape or dtype differs, or no cell is left.
         """
-        wanted = [n - 1 for n in self.shape]
-        if list(cells.shape) != wanted or cells.dtype != torch.bool:
-            raise ValueError(f"active_cells: wanted bool {wanted}, got {cells.dtype} {list(cells.shape)}")
+        self._check_cells("active_cells", cells)
         if not bool(cells.any()):
             raise ValueError("active_cells: wanted at least one cell, got none")
         self.active_cells.copy_(cells)
         self._update_active_nodes()
+
+    def _check_cells(self, name: str, cells: Tensor) -> None:
+        wanted = [n - 1 for n in self.shape]
+        if not isinstance(cells, Tensor) or list(cells.shape) != wanted or cells.dtype != torch.bool:
+            came = f"{cells.dtype} {list(cells.shape)}" if isinstance(cells, Tensor) else type(cells).__name__
+            raise ValueError(f"{name}: wanted bool {wanted}, got {came}")
 
     def _update_active_nodes(self) -> None:
         """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""

@@ -35,6 +35,8 @@ class CanonicalGrid:
         if checked:
             return
         for name in ("lower", "upper"):
+            if not isinstance(getattr(self, name), Tensor):
+                raise TypeError(f"grid.{name}: wanted a tensor [3], got a {type(getattr(self, name)).__name__}")
             if tuple(getattr(self, name).shape) != (3,):
                 raise ValueError(f"grid.{name}: wanted shape [3], got {list(getattr(self, name).shape)}")
         if not bool((self.upper > self.lower).all()):
@@ -44,6 +46,9 @@ class CanonicalGrid:
     def around(cls, points: Tensor, margin: Sequence[float]) -> CanonicalGrid:
         """Return the box of `points` [N, 3] widened by `margin` (x, y, z) on either side, metres."""
         widen = torch.as_tensor(margin, dtype=points.dtype, device=points.device)
+        if points.ndim != 2 or points.shape[1] != 3 or not len(points) or widen.shape != (3,):
+            shapes = f"{list(points.shape)} and {list(widen.shape)}"
+            raise ValueError(f"points, margin: wanted shapes [N, 3], at least one point, and [3], got {shapes}")
         return cls(points.amin(0) - widen, points.amax(0) + widen)
 
     @property

@@ -17,7 +17,15 @@ from snarfcli.deformer.search_config import SearchConfig, as_search_config, chec
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.deformer.starts import check_starts, start_transforms
 
-__all__ = ["BlendedPoses", "check_capacity", "check_points", "check_transforms", "check_values", "find_correspondences"]
+__all__ = [
+    "BlendedPoses",
+    "check_capacity",
+    "check_points",
+    "check_tensor",
+    "check_transforms",
+    "check_values",
+    "find_correspondences",
+]
 
 
 def find_correspondences(
@@ -164,8 +172,15 @@ def check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights:
             raise ValueError(f"skinning_weights: wanted a sum of 1 at every node of a searched cell, got {came:.4g}")
 
 
+def check_tensor(name: str, value: object) -> None:
+    """Raise TypeError for what is not a tensor."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: wanted a tensor, got a {type(value).__name__}; torch.as_tensor makes one")
+
+
 def check_points(points: Tensor, poses: Tensor | None = None, name: str = "points") -> None:
     """Raise ValueError or TypeError if points are not [B, N, 3], or do not fit the transforms [B, J, 4, 4] of poses."""
+    check_tensor(name, points)
     if points.ndim != 3 or points.shape[2] != 3:
         raise ValueError(f"{name}: wanted shape [B, N, 3], got {list(points.shape)}")
     if poses is None:
@@ -187,6 +202,8 @@ def check_capacity(capacity: int | None) -> None:
 def _check_shapes(points: Tensor, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:
     """Raise ValueError or TypeError if the tensors do not fit together."""
     check_points(points)
+    check_tensor("bone_transforms", bone_transforms)
+    check_tensor("skinning_weights", skinning_weights)
     batch, shape = points.shape[0], list(skinning_weights.shape)
     if len(shape) not in (4, 5) or min(shape[-4:-1]) < 2 or shape[-1] < 1:
         raise ValueError(f"skinning_weights: wanted shape [D, H, W, J], at least 2 nodes per side, got {shape}")

@@ -10,7 +10,15 @@ import torch
 from skinning_scenes import random_transforms, unit_grid
 from torch import nn
 
-from snarfcli.deformer import BonePrior, ForwardDeformer, NodeWeights, PresetWeights, SearchConfig, SkinningConfig
+from snarfcli.deformer import (
+    BonePrior,
+    CanonicalGrid,
+    ForwardDeformer,
+    NodeWeights,
+    PresetWeights,
+    SearchConfig,
+    SkinningConfig,
+)
 
 SHAPE = (6, 7, 8)
 NODES = math.prod(SHAPE)
@@ -189,3 +197,26 @@ def test_settings_that_a_deformer_does_not_use_are_refused():
     for name in ("margin_m", "bone_radius_m", "prior_falloff_m", "smoothness", "symmetric", "weights_file"):
         with pytest.raises(TypeError, match=name):
             SkinningConfig(**{name: None})
+
+
+def test_a_field_at_grid_nodes_brings_its_settings():
+    preset = PresetWeights(unit_grid(torch.float32), torch.rand(*SHAPE, 3).softmax(-1))
+    deformer = ForwardDeformer(unit_grid(torch.float32), 3, field=preset)
+    assert deformer.shape == SHAPE
+    assert torch.equal(deformer.weight_grid().reshape(-1, 3), preset.weights)
+
+
+def test_what_is_no_tensor_or_does_not_fit_is_named():
+    deformer, transforms = make("distilled"), random_transforms(2, 3, 0.3, dtype=torch.float32)
+    cells = torch.ones(2, 2, 2, dtype=torch.bool)
+    for call, error, message in [
+        (lambda: CanonicalGrid([0, 0, 0], [1, 1, 1]), TypeError, r"grid.lower: wanted a tensor \[3\], got a list"),
+        (lambda: CanonicalGrid.around(points(5), [0.1]), ValueError, r"points, margin: wanted shapes"),
+        (lambda: ForwardDeformer(unit_grid(), 0), ValueError, "num_bones: wanted at least 1, got 0"),
+        (lambda: deformer(points(5)[None].numpy(), transforms[:1]), TypeError, "points: wanted a tensor, got a ndarray"),
+        (lambda: deformer.pose(transforms.numpy()), TypeError, "bone_transforms: wanted a tensor, got a ndarray"),
+        (lambda: deformer.posed_box(transforms[0], cells), ValueError, r"cells: wanted bool \[5, 6, 7\]"),
+        (lambda: deformer.set_active_cells(cells), ValueError, r"active_cells: wanted bool \[5, 6, 7\]"),
+    ]:
+        with pytest.raises(error, match=message):
+            call()

@@ -336,6 +336,16 @@ def test_skinning_knows_the_weights_of_all_cells():
         torch.testing.assert_close(posed.skin(x, directions=along)[1], difference, rtol=1e-5, atol=1e-5)
 
 
+def test_given_weights_are_those_of_all_that_a_pose_does():
+    _, transforms, weights = scene(torch.float64)
+    cells = torch.zeros(5, 6, 7, dtype=torch.bool)
+    cells[2] = True
+    deformer, other = deformer_of(weights, cells=cells), deformer_of(weights.flip(0), cells=cells)
+    posed = deformer.pose(transforms, weights=other.node_weights(active_only=False))
+    x = torch.rand(2, 40, 3, dtype=torch.float64) - 0.5
+    torch.testing.assert_close(posed.skin(x), other.skin(x, transforms))
+
+
 @pytest.mark.parametrize("backend", ["native", "reference"])
 def test_the_box_holds_all_that_is_searched(backend):
     points, transforms, weights = scene(count=500, angle=1.0)

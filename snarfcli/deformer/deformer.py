@@ -209,9 +209,11 @@ class ForwardDeformer(ForwardSkinning):
 
     def _pose(self, bone_transforms: Tensor, given: NodeWeights | None) -> PosedDeformer:
         """As `pose`. Not to be compiled: pointers of the native library; what the poses do can be compiled."""
-        self._check_poses(bone_transforms)
+        self._check_poses(bone_transforms, given)
         check_search_config(self.search, self.num_bones)
-        with torch.autocast(bone_transforms.device.type, enabled=False):
+        is_recorded, full_precision = torch.is_grad_enabled(), torch.autocast(bone_transforms.device.type, enabled=False)
+        # What is made in inference mode may be used outside of it, where autograd cannot save inference tensors.
+        with torch.inference_mode(False), torch.set_grad_enabled(is_recorded), full_precision:
             check_transforms(bone_transforms)
             if self.searches_field:
                 return PosedField(

@@ -235,13 +235,15 @@ class FieldOnGrid(nn.Module):
         return weights.to(self.lower.dtype)
 
     def smoothness(self, weights: NodeWeights | None = None) -> Tensor:
-        """Return the total variation of the weights over the nodes of active cells (see `total_variation`).
+        """Return the total variation of the weights over the nodes of active cells (see `total_variation`), [].
 
         Args:
-            weights: from `node_weights`, if they have been evaluated already.
+            weights: from `node_weights`, if they have been evaluated already. Needed for a field with a parameter `pose_index`,
+                for the mean over its poses.
         """
         values = self.weight_grid(active_only=True) if weights is None else weights.values
-        return total_variation(values, self.grid, self._used_nodes)
+        of_poses = values if values.ndim == 5 else values[None]
+        return torch.stack([total_variation(one, self.grid, self._used_nodes) for one in of_poses]).mean()
 
     # ---------------------------------------------------------------- cells
     def set_active_cells(self, cells: Tensor) -> None:

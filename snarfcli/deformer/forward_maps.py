@@ -10,9 +10,10 @@ from torch import Tensor
 
 from snarfcli.deformer.callables import with_pose
 from snarfcli.deformer.centring import Centred
+from snarfcli.deformer.inference_tensors import NormalTensors
 from snarfcli.deformer.skinning import between_corners, blended_matrices, moved_vectors, trilinear_transforms
 
-__all__ = ["ForwardMap", "map_by_weights", "map_in_cells", "map_on_field"]
+__all__ = ["ForwardMap", "check_vectors", "map_by_weights", "map_in_cells", "map_on_field"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,19 @@ class ForwardMap:
         origin = centred.posed_origin[:, None]
         shift = self.rows[..., 3] - (self.rows[..., :3] * centred.canonical_origin).sum(-1) + origin
         return ForwardMap(torch.cat([self.rows[..., :3], shift[..., None]], -1), self.posed + origin, self.jacobian)
+
+
+def check_vectors(points: Tensor, **vectors: Tensor | None) -> None:
+    """Raise ValueError or TypeError for vectors that do not have the shape, dtype and device of the points."""
+    for name, given in vectors.items():
+        if given is None:
+            continue
+        if given.shape != points.shape:
+            raise ValueError(f"{name}: wanted the shape of the points, {list(points.shape)}, got {list(given.shape)}")
+        if given.dtype != points.dtype:
+            raise TypeError(f"{name}: wanted the dtype of the points, {points.dtype}, got {given.dtype}")
+        if given.device != points.device:
+            raise ValueError(f"{name}: wanted the device of the points, {points.device}, got {given.device}")
 
 
 def map_in_cells(
@@ -85,6 +99,9 @@ def map_on_field(field: Callable[..., Tensor], canonical: Tensor, bone_transform
         bone_transforms: [B, J, 4, 4], canonical to posed, metres.
         with_jacobian: whether the Jacobian is computed.
     """
+    if with_jacobian and torch.is_inference_mode_enabled():  # whose tensors have no derivatives
+        with torch.inference_mode(False), torch.no_grad(), NormalTensors():
+            return map_on_field(field, canonical, bone_transforms, with_jacobian)
     batch, count = canonical.shape[:2]
     is_recorded = torch.is_grad_enabled()
     pose = torch.arange(batch, device=canonical.device).repeat_interleave(count)
@@ -94,7 +111,7 @@ def map_on_field(field: Callable[..., Tensor], canonical: Tensor, bone_transform
         if tuple(weights.shape) != (batch * count, bone_transforms.shape[1]):
             wanted = [batch * count, bone_transforms.shape[1]]
             raise ValueError(f"field: wanted weights of shape {wanted}, got {list(weights.shape)}")
-        weights = weights.reshape(batch, count, -1).to(canonical.dtype)
+        weights = weights.reshape(batch, count, bone_transforms.shape[1]).to(canonical.dtype)
         at = map_by_weights(weights, x, bone_transforms)
         if not with_jacobian:
             return at

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.field_on_grid import FieldOnGrid
-from snarfcli.deformer.forward_maps import ForwardMap, map_by_weights, map_in_cells, map_on_field
+from snarfcli.deformer.forward_maps import ForwardMap, check_vectors, map_by_weights, map_in_cells, map_on_field
 from snarfcli.deformer.grid_search import check_points, check_tensor
 from snarfcli.deformer.skinning import blend_transforms
+from snarfcli.deformer.weights import NodeWeights
 
 __all__ = ["ForwardSkinning"]
 
@@ -49,9 +50,7 @@ class ForwardSkinning(FieldOnGrid):
 
         Source: SNARF Eq. 4.
         """
-        for name, vectors in (("directions", directions), ("normals", normals)):
-            if vectors is not None and vectors.shape != canonical.shape:
-                raise ValueError(f"{name}: wanted the shape of the points, {list(canonical.shape)}, got {list(vectors.shape)}")
+        check_vectors(canonical, directions=directions, normals=normals)
         is_one = canonical.ndim == 2 and bone_transforms.ndim == 3
         if is_one:
             canonical, bone_transforms = canonical[None], bone_transforms[None]
@@ -73,7 +72,6 @@ class ForwardSkinning(FieldOnGrid):
 
     def _forward_map(self, canonical: Tensor, bone_transforms: Tensor, with_jacobian: bool) -> ForwardMap:
         self._check_poses(bone_transforms)
-        canonical = canonical.to(bone_transforms.dtype)
         check_points(canonical, bone_transforms, "canonical")
         batch, count = canonical.shape[:2]
         with torch.autocast(canonical.device.type, enabled=False):
@@ -82,27 +80,31 @@ class ForwardSkinning(FieldOnGrid):
             pose = torch.arange(batch, device=canonical.device).repeat_interleave(count)
             if not with_jacobian:  # without corners, in a fifth of the time
                 weights = self.skinning_weights(canonical.reshape(-1, 3), pose_index=pose)
-                return map_by_weights(weights.reshape(batch, count, -1), canonical, bone_transforms)
+                return map_by_weights(weights.reshape(batch, count, self.num_bones), canonical, bone_transforms)
             corners, local = self.corner_weights(canonical.reshape(-1, 3), pose)
-            transforms = blend_transforms(corners.reshape(batch, 1, count, 8, -1), bone_transforms)
+            transforms = blend_transforms(corners.reshape(batch, 1, count, 8, self.num_bones), bone_transforms)
             transforms = transforms.reshape(batch, count, 8, 12)
             size = self.grid.cell_size(self.shape)
             return map_in_cells(transforms, local.reshape(batch, count, 3), canonical, size, with_jacobian)
 
-    def _check_poses(self, bone_transforms: Tensor) -> None:
-        """Raise ValueError or TypeError for transforms that are not [B, J, 4, 4] or do not fit the deformer."""
+    def _check_poses(self, bone_transforms: Tensor, weights: NodeWeights | None = None) -> None:
+        """Raise ValueError or TypeError for transforms that are not [B, J, 4, 4], or for either if it does not fit."""
         check_tensor("bone_transforms", bone_transforms)
-        shape = list(bone_transforms.shape)
+        given, shape = {"bone_transforms": bone_transforms}, list(bone_transforms.shape)
         if len(shape) != 4 or shape[1:] != [self.num_bones, 4, 4]:
             raise ValueError(f"bone_transforms: wanted shape [B, {self.num_bones}, 4, 4], got {shape}")
-        if bone_transforms.dtype != self.lower.dtype:
-            raise TypeError(
-                f"bone_transforms: wanted the dtype of the deformer, {self.lower.dtype}, got {bone_transforms.dtype}"
-            )
-        if bone_transforms.device != self.lower.device:
-            raise ValueError(
-                f"bone_transforms: wanted the device of the deformer, {self.lower.device}, got {bone_transforms.device}"
-            )
+        if weights is not None:
+            given["weights"], wanted = weights.values, [*self.shape, self.num_bones]
+            if list(weights.values.shape) not in (wanted, [shape[0], *wanted]):
+                raise ValueError(
+                    f"weights: wanted shape {wanted}, or {[shape[0], *wanted]} for weights of each pose, "
+                    f"got {list(weights.values.shape)}"
+                )
+        for name, tensor in given.items():
+            if tensor.dtype != self.lower.dtype:
+                raise TypeError(f"{name}: wanted the dtype of the deformer, {self.lower.dtype}, got {tensor.dtype}")
+            if tensor.device != self.lower.device:
+                raise ValueError(f"{name}: wanted the device of the deformer, {self.lower.device}, got {tensor.device}")
 
     # ---------------------------------------------------------------- boxes
     def posed_box(self, bone_transforms: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:

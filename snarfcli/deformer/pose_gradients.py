@@ -8,6 +8,7 @@ add their gradients to one array. Autograd comes to the function behind the tick
 from __future__ import annotations
 
 import threading
+from weakref import WeakValueDictionary
 
 import torch
 from torch import Tensor
@@ -36,27 +37,43 @@ class PoseGradients:
         return self._sums.of_this_pass()
 
 
+class _Sum:
+    """The sum of one pass."""
+
+    def __init__(self, total: Tensor) -> None:
+        self.total: Tensor | None = total
+
+    def take(self) -> Tensor | None:
+        total, self.total = self.total, None
+        return total
+
+    def drop(self) -> None:
+        self.total = None
+
+
 class _Sums:
+    """The sums of the passes that are under way; one that fails, or is not asked for the sum, leaves none behind."""
+
     def __init__(self, like: Tensor) -> None:
         self.like = like
-        self._by_pass: dict[int, Tensor] = {}
+        self._by_pass: WeakValueDictionary[int, _Sum] = WeakValueDictionary()
         self._lock = threading.Lock()
 
     def of_this_pass(self) -> Tensor:
         number = torch._C._current_graph_task_id()
         with self._lock:
-            if number not in self._by_pass:
-                self._by_pass[number] = torch.zeros_like(self.like)
-                # A pass that is not asked for the gradient by the transforms never takes the sum.
-                Variable._execution_engine.queue_callback(lambda: self.drop(number))
-            return self._by_pass[number]
+            one = self._by_pass.get(number)
+            if one is None or one.total is None:
+                one = self._by_pass[number] = _Sum(torch.zeros_like(self.like))
+                Variable._execution_engine.queue_callback(one.drop)  # only the pass holds the sum
+            assert one.total is not None
+            return one.total
 
-    def take(self, number: int) -> Tensor | None:
+    def take(self) -> Tensor | None:
+        """Return the sum of the pass that is under way, and forget it; None if nothing was added."""
         with self._lock:
-            return self._by_pass.pop(number, None)
-
-    def drop(self, number: int) -> None:
-        self.take(number)
+            one = self._by_pass.get(torch._C._current_graph_task_id())
+            return None if one is None else one.take()
 
 
 class _Ticket(torch.autograd.Function):
@@ -68,7 +85,7 @@ class _Ticket(torch.autograd.Function):
     @staticmethod
     @differentiable_once
     def backward(ctx, gradient):
-        return ctx.sums.take(torch._C._current_graph_task_id()), None
+        return ctx.sums.take(), None
 
 
 def corners_of_poses(gradients: PoseGradients, nodes: Tensor) -> Tensor:

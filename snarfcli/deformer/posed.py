@@ -14,7 +14,7 @@ from torch import Tensor
 from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.field_search import find_correspondences_on_field
-from snarfcli.deformer.forward_maps import ForwardMap, map_in_cells, map_on_field
+from snarfcli.deformer.forward_maps import ForwardMap, check_vectors, map_in_cells, map_on_field
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
 from snarfcli.deformer.grid_search import BlendedPoses, check_capacity, check_points
 from snarfcli.deformer.implicit import add_implicit_gradient
@@ -31,9 +31,10 @@ __all__ = ["PosedDeformer", "PosedField", "PosedGrid"]
 class PosedDeformer(ABC):
     """A deformer in B poses, made by `ForwardDeformer.pose`: what all calls need is computed once.
 
-    It keeps the weights and cells that the deformer had when it was made. Gradients to the weights and transforms are gathered
-    from all calls and passed on once per backward pass. So add up the losses of all chunks and call `backward` once; every
-    further pass needs the graph of the pose again (`retain_graph=True` for all but the last).
+    It keeps the cells that the deformer had when it was made, and the weights in them; those elsewhere are evaluated when
+    `skin` or `transforms_at` is first called. Gradients to the weights and transforms are gathered from all calls and passed
+    on once per backward pass. So add up the losses of all chunks and call `backward` once; every further pass needs the graph
+    of the pose again (`retain_graph=True` for all but the last).
     """
 
     bone_transforms: Tensor
@@ -93,9 +94,7 @@ class PosedDeformer(ABC):
 
         Source: SNARF Eq. 4.
         """
-        for name, vectors in (("directions", directions), ("normals", normals)):
-            if vectors is not None and vectors.shape != canonical.shape:
-                raise ValueError(f"{name}: wanted the shape of the points, {list(canonical.shape)}, got {list(vectors.shape)}")
+        check_vectors(canonical, directions=directions, normals=normals)
         with_jacobian = directions is not None or normals is not None
         return self._checked_map(canonical, with_jacobian).skinned(directions, normals)
 
@@ -157,6 +156,7 @@ class PosedGrid(PosedDeformer):
         self.bone_transforms = bone_transforms
         self._searched = _Gathered(poses)
         self._everywhere = everywhere
+        self._is_recorded = torch.is_grad_enabled()
         self._all_nodes: _Gathered | None = None
         self._cells: cpu.PreparedCells | None = None
         self._boxes: Tensor | None = None
@@ -223,20 +223,27 @@ class PosedGrid(PosedDeformer):
         origin = still.centred.posed_origin
         return (lower, upper) if origin is None else (lower + origin, upper + origin)
 
-    def _map(self, canonical: Tensor, with_jacobian: bool) -> ForwardMap:
+    @property
+    def _gathered(self) -> _Gathered:
+        """The poses blended at all nodes, with gradients if the pose was made with them, wherever it is asked for first."""
         if self._all_nodes is None:
-            poses = self._everywhere()
-            self._all_nodes = self._searched if poses is self._searched.poses else _Gathered(poses)
-        poses = self._all_nodes.still
+            with torch.inference_mode(False), torch.set_grad_enabled(self._is_recorded):
+                poses = self._everywhere()
+                self._all_nodes = self._searched if poses is self._searched.poses else _Gathered(poses)
+        return self._all_nodes
+
+    def _map(self, canonical: Tensor, with_jacobian: bool) -> ForwardMap:
+        gathered = self._gathered
+        poses = gathered.still
         nodes, size = math.prod(poses.shape), poses.centred.grid.cell_size(poses.shape)
         x = poses.centred.starts(canonical)
         cell, local = locate(x, poses.centred.grid, poses.shape)
         first = nodes * torch.arange(len(x), device=x.device)[:, None, None]
         at_corners = (cell_corners(cell, poses.shape) + first).reshape(-1, 8)
-        if torch.compiler.is_compiling():  # as in a search
-            corners = self._all_nodes.poses.transforms.reshape(-1, 12)[at_corners]
+        if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active():  # as in a search; and torch.func
+            corners = gathered.poses.transforms.reshape(-1, 12)[at_corners]
         else:
-            corners = corners_of_poses(self._all_nodes.gradients, at_corners)
+            corners = corners_of_poses(gathered.gradients, at_corners)
         at = map_in_cells(corners.reshape(*x.shape[:2], 8, 12), local, x, size, with_jacobian)
         return at.restored(poses.centred)
 

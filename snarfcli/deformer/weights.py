@@ -116,8 +116,7 @@ class NetworkWeights(WeightField):
         self.softmax = softmax
         self.sharpness = sharpness
         self.prior = prior
-        self._last_points: Tensor | None = None
-        self._last_logits = torch.empty(0)
+        self._last: tuple[Tensor, Tensor] | None = None  # points, and the logits of the prior there
         self.register_buffer("centre", torch.empty(0), persistent=False)
         self.register_buffer("half_extent", torch.empty(0), persistent=False)
         self.set_box(grid)
@@ -162,9 +161,10 @@ class NetworkWeights(WeightField):
     def _kept_prior(self, canonical: Tensor) -> Tensor:
         """Return the logits of the prior, which are kept for the last tensor of points."""
         assert self.prior is not None
-        if self._last_points is not canonical:
-            self._last_points, self._last_logits = canonical, self.softmax.invert(self.prior(canonical)).detach()
-        return self._last_logits
+        last = self._last  # in one piece, since another thread may replace it
+        if last is None or last[0] is not canonical:
+            last = self._last = canonical, self.softmax.invert(self.prior(canonical)).detach()
+        return last[1]
 
 
 class GridWeights(WeightField):

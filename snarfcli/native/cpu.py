@@ -91,6 +91,8 @@ def blend(weights: Tensor, bones: Tensor, active: Tensor | None) -> Tensor:
     """
     weights, bones, active = _blending_inputs(weights, bones, active)
     out = weights.new_empty(len(bones), weights[..., 0].numel(), 12)
+    if not out.numel():  # points that are blended as nodes are may be none
+        return out
     blending = _blending(weights, bones, active)
     _raise_for(_library().snarf_blend(byref(blending), c_void_p(out.data_ptr())))
     return out
@@ -104,6 +106,8 @@ def blend_backward(
     weights, bones, active = _blending_inputs(weights, bones, active)
     v_weights = torch.empty_like(weights) if wants[0] else weights.new_empty(0)
     v_bones = torch.empty_like(bones) if wants[1] else bones.new_empty(0)
+    if not gradient.numel():
+        return v_weights.zero_(), v_bones.zero_()
     blending = _blending(weights, bones, active)
     results = [c_void_p(out.data_ptr() if wanted else None) for out, wanted in zip((v_weights, v_bones), wants, strict=True)]
     _raise_for(_library().snarf_blend_backward(byref(blending), c_void_p(gradient.data_ptr()), *results))

@@ -152,6 +152,14 @@ def test_weights_and_skinning_are_exact_under_autocast(name):
         torch.testing.assert_close(deformer.skinning_weights(x[0]), wanted[0], rtol=0, atol=1e-5)
 
 
+def test_smoothness_of_weights_that_differ_from_pose_to_pose():
+    deformer = make("distilled", field=Counted())
+    one, other = (torch.rand(*SHAPE, 3).softmax(-1) for _ in range(2))
+    alone = [deformer.smoothness(NodeWeights(values, deformer.grid)) for values in (one, other)]
+    both = deformer.smoothness(NodeWeights(torch.stack([one, other]), deformer.grid))
+    torch.testing.assert_close(both, (alone[0] + alone[1]) / 2)
+
+
 # ---------------------------------------------------------------- frozen grids
 def test_a_frozen_grid_survives_what_does_not_change_it():
     """Evaluation is switched on before every validation, also of an outer module; moves take the grid along."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import subprocess
@@ -251,6 +252,65 @@ def test_passes_do_not_disturb_each_other():
     assert not posed._searched.gradients._sums._by_pass
 
 
+def test_a_pass_that_fails_leaves_no_sum_behind():
+    points, transforms, weights = scene()
+    points.requires_grad_()
+    posed = deformer_of(weights).pose(transforms)
+    loss = posed(points).canonical.square().sum()
+
+    def fail(gradient):
+        raise KeyError("before the weights are reached")
+
+    points.register_hook(fail)
+    with pytest.raises(KeyError):
+        loss.backward()
+    gc.collect()
+    assert not posed._searched.gradients._sums._by_pass
+
+
+@pytest.mark.parametrize("first", [torch.no_grad, torch.inference_mode])
+def test_who_asks_first_does_not_decide_on_gradients(first):
+    """The transforms of cells that are not searched are blended when they are first needed."""
+    points, transforms, weights = scene(torch.float64)
+    cells = torch.zeros(5, 6, 7, dtype=torch.bool)
+    cells[2] = True
+    deformer = deformer_of(weights, cells=cells)
+    wanted = torch.autograd.grad(deformer.skin(points, transforms).square().sum(), deformer.field.values)[0]
+    posed = deformer.pose(transforms)
+    with first():
+        assert not posed.skin(points).requires_grad
+    mine = torch.autograd.grad(posed.skin(points).square().sum(), deformer.field.values)[0]
+    torch.testing.assert_close(mine, wanted)
+    with first():
+        posed = deformer.pose(transforms)
+    assert not posed.skin(points).requires_grad
+
+
+@pytest.mark.parametrize("far", [0.0, 8192.0])
+def test_a_pose_of_inference_mode_can_be_used_outside_of_it(far):
+    points, transforms, weights = scene(angle=0.2)
+    transforms[..., :3, 3] += far
+    deformer = deformer_of(weights)
+    with torch.inference_mode():
+        posed = deformer.pose(transforms)
+    points.requires_grad_()
+    found = posed(points + far)
+    (gradient,) = torch.autograd.grad(found.canonical.sum(), points)
+    (wanted,) = torch.autograd.grad(deformer(points + far, transforms).canonical.sum(), points)
+    torch.testing.assert_close(gradient, wanted)
+    assert torch.autograd.grad(posed.skin(points, normals=points)[1].square().sum(), points)[0].isfinite().all()
+
+
+def test_skinning_works_under_transforms_of_functions():
+    points, transforms, weights = scene(torch.float64)
+    deformer = deformer_of(weights)
+    posed = deformer.pose(transforms)
+    x = 0.5 * points
+    wanted = torch.func.grad(lambda x: deformer.skin(x, transforms).square().sum())(x)
+    torch.testing.assert_close(torch.func.grad(lambda x: posed.skin(x).square().sum())(x), wanted)
+    torch.testing.assert_close(torch.func.vmap(posed.skin)(torch.stack([x, -x]))[1], posed.skin(-x))
+
+
 @pytest.mark.parametrize("loss", [lambda roots: roots.square().sum(), lambda roots: roots.sum()])
 def test_a_loss_that_needs_a_second_derivative_is_refused(loss):
     """Also where only the inverse Jacobian depends on the points and weights."""
@@ -291,6 +351,31 @@ def test_no_gradient_is_tracked_without_need():
 
 
 # ---------------------------------------------------------------- forward skinning
+@pytest.mark.parametrize("make", [field_deformer, lambda: deformer_of(smooth_weights(SHAPE, 3))])
+def test_no_points_and_no_poses_are_skinned(make):
+    deformer, transforms = make(), random_transforms(2, 3, 0.5)
+    for batch, count in ((2, 0), (0, 5), (0, 0)):
+        x = torch.zeros(batch, count, 3, dtype=torch.float64)
+        moves = transforms[:batch].clone().requires_grad_()
+        for skin in (deformer.pose(moves).skin, lambda x, moves=moves, **more: deformer.skin(x, moves, **more)):
+            moved, normals = skin(x, normals=x)
+            assert moved.shape == normals.shape == x.shape
+            assert not torch.autograd.grad(moved.sum() + normals.sum(), moves)[0].any()
+
+
+def test_normals_of_a_field_are_moved_in_inference_mode():
+    """They need a derivative of the field, which inference tensors have not."""
+    deformer = field_deformer()
+    x = torch.rand(2, 9, 3, dtype=torch.float64) - 0.5
+    transforms = random_transforms(2, 3, 0.5)
+    wanted = deformer.skin(x, transforms, normals=x)
+    with torch.inference_mode():
+        x, transforms = x.clone(), transforms.clone()
+        for results in (deformer.skin(x, transforms, normals=x), deformer.pose(transforms).skin(x, normals=x)):
+            for mine, one in zip(results, wanted, strict=True):
+                torch.testing.assert_close(mine, one.detach())
+
+
 @pytest.mark.parametrize("make", [field_deformer, lambda: deformer_of(smooth_weights(SHAPE, 3))])
 def test_skinning_in_a_pose_is_exact(make):
     """Against plain blending, with directions and normals against differences."""
@@ -385,7 +470,12 @@ def test_autocast_changes_nothing():
 
 
 def test_what_does_not_fit_is_named():
+    """Weights as well: the native library would read beyond the end of arrays that are too small."""
     points, transforms, weights = scene()
+
+    def nodes(values):
+        return NodeWeights(values, unit_grid(values.dtype))
+
     deformer = deformer_of(weights)
     posed = deformer.pose(transforms)
     for call, error, message in [
@@ -398,6 +488,11 @@ def test_what_does_not_fit_is_named():
         (lambda: posed(points, starts=points[:, :, None]), ValueError, "starts"),
         (lambda: posed.skin(points[0]), ValueError, r"canonical: wanted shape \[B, N, 3\], got \[40, 3\]"),
         (lambda: posed.skin(points, normals=points[:, :1]), ValueError, r"normals: wanted the shape of the points"),
+        (lambda: posed.skin(points, normals=points.double()), TypeError, "normals: wanted the dtype of the points"),
+        (lambda: deformer.skin(points.double(), transforms), TypeError, "canonical: wanted the dtype of the poses"),
+        (lambda: deformer.pose(transforms, nodes(weights.double())), TypeError, "weights: wanted the dtype of the deformer"),
+        (lambda: deformer.pose(transforms, nodes(weights[..., 1:])), ValueError, r"weights: wanted shape \[6, 7, 8, 4\], or"),
+        (lambda: deformer.pose(transforms, nodes(weights[1:])), ValueError, r"for weights of each pose, got \[5, 7, 8, 4\]"),
         (lambda: deformer.skin(points, transforms[:, :3]), ValueError, r"bone_transforms: wanted shape \[B, 4, 4, 4\]"),
         (lambda: field_deformer().pose(transforms[:, :3].double())(points.double(), 5), ValueError, "capacity: wanted None"),
     ]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
+from typing import Any, TypeVar
 
 import torch
 
-__all__ = ["PRECISIONS", "matmul_precision", "network_precision"]
+__all__ = ["PRECISIONS", "matmul_precision", "network_precision", "without_autocast"]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 PRECISIONS = ("highest", "high", "medium", "bfloat16")
 """Names of the precisions of a network, see `network_precision`."""
@@ -25,6 +29,18 @@ def matmul_precision(name: str) -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+def without_autocast(function: Function) -> Function:
+    """Run a function in the precision of its arguments, also under autocast, which would round poses by millimetres."""
+
+    @wraps(function)
+    def exact(*arguments: Any, **keywords: Any) -> Any:
+        # of all types of device, since the arguments may be anywhere
+        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+            return function(*arguments, **keywords)
+
+    return exact  # pyright: ignore[reportReturnType]
 
 
 @contextmanager

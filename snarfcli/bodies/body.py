@@ -11,6 +11,7 @@ from torch import Tensor
 
 from snarfcli.bodies.kinematics import axis_angle_to_matrix, forward_kinematics
 from snarfcli.bodies.skeleton import Skeleton, legs_apart_pose
+from snarfcli.precision import without_autocast
 
 __all__ = ["Body", "PosedBody"]
 
@@ -68,6 +69,7 @@ class Body:
         moved["faces"] = self.faces.to(moved["weights"].device)
         return replace(self, **moved)
 
+    @without_autocast
     def shaped(self, betas: Tensor | np.ndarray | None = None) -> tuple[Tensor, Tensor]:
         """Return the rest pose of one shape.
 
@@ -89,6 +91,7 @@ class Body:
             v_shaped = v_shaped + self.shapedirs[..., : len(betas)] @ betas
         return v_shaped, self.joint_regressor @ v_shaped
 
+    @without_autocast
     def pose(
         self,
         pose: Tensor | np.ndarray,

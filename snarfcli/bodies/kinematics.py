@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from snarfcli.precision import without_autocast
+
 __all__ = [
     "axis_angle_to_matrix",
     "forward_kinematics",
@@ -99,6 +101,7 @@ def matrix_to_axis_angle(matrix: Tensor) -> Tensor:
     return scale[..., None] * v
 
 
+@without_autocast
 def invert_rigid(transform: Tensor) -> Tensor:
     """Invert rigid transforms [..., 4, 4] exactly, with the transposed rotation."""
     rotation_t = transform[..., :3, :3].transpose(-1, -2)
@@ -106,6 +109,7 @@ def invert_rigid(transform: Tensor) -> Tensor:
     return torch.cat([torch.cat([rotation_t, translation], -1), transform[..., 3:, :]], -2)
 
 
+@without_autocast
 def forward_kinematics(
     pose: Tensor, joints_rest: Tensor, parents: Sequence[int], translation: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:

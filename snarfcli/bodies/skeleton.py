@@ -13,6 +13,7 @@ from torch import Tensor
 
 from snarfcli.bodies.kinematics import forward_kinematics, invert_rigid
 from snarfcli.field_docs import documented
+from snarfcli.precision import without_autocast
 
 __all__ = [
     "CANONICAL_HIP_RAD",
@@ -121,6 +122,7 @@ class Skeleton:
         """Return the bone transforms [B, J, 4, 4] from the rest pose to `pose` [B, J, 3], axis-angle, radians."""
         return forward_kinematics(pose, self.joints_rest.to(pose), self.parents, translation)[1]
 
+    @without_autocast
     def posed_from_canonical(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
         """Return the bone transforms from the canonical frame to a pose (SNARF's B_j, Eq. 4).
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -44,6 +44,17 @@ class CanonicalBody:
     """Grid nodes (D, H, W) along z, y, x."""
     active_cells: Tensor
     """[D-1, H-1, W-1], bool, the cells near the body."""
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> CanonicalBody:
+        """Return the body with all tensors changed by a function, such as one that moves them to a device."""
+        skeleton = replace(
+            self.skeleton,
+            joints_rest=change(self.skeleton.joints_rest),
+            canonical_pose=change(self.skeleton.canonical_pose),
+        )
+        grid = CanonicalGrid(change(self.grid.lower), change(self.grid.upper), checked=True)
+        vertices, weights, cells = (change(tensor) for tensor in (self.vertices, self.weights, self.active_cells))
+        return CanonicalBody(skeleton, vertices, weights, grid, self.shape, cells)
 
     def posed_from_canonical(self, pose: Tensor, translation: Tensor | None = None) -> Tensor:
         """Return the bone transforms [B, J, 4, 4] that a deformer takes, metres.

@@ -17,7 +17,7 @@ __all__ = ["Correspondences"]
 
 
 @documented
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False, eq=False)
 class Correspondences:
     """Canonical correspondences of B x N posed points: the roots of all queries in one list.
 
@@ -42,6 +42,9 @@ class Correspondences:
     total: Tensor
     """[1], number of roots found; more than M only if a capacity cut them."""
     _is_reported: ClassVar[bool] = False  # on an instance: whether a cut has been looked for
+
+    def __repr__(self) -> str:
+        return f"Correspondences({self.query.shape[0]} rows for {self.batch} x {self.count} points)"
 
     @property
     def pose(self) -> Tensor:

@@ -20,6 +20,7 @@ from snarfcli.deformer.posed import PosedDeformer, PosedField, PosedGrid
 from snarfcli.deformer.search_config import SearchConfig, as_search_config, check_search_config
 from snarfcli.deformer.skinning_config import FIELDS, SkinningConfig
 from snarfcli.deformer.weights import GridWeights, NetworkWeights, NodeWeights, VoxelWeights, WeightField
+from snarfcli.precision import without_autocast
 
 __all__ = ["ForwardDeformer"]
 
@@ -46,7 +47,7 @@ class ForwardDeformer(ForwardSkinning):
     """
 
     body: CanonicalBody | None = None
-    """The body that the deformer was made for by `from_body`; not part of the state."""
+    """The body that the deformer was made for by `from_body`; moves with the deformer, and is not part of the state."""
 
     def __init__(
         self,
@@ -80,6 +81,7 @@ class ForwardDeformer(ForwardSkinning):
         self.search = as_search_config(search or ("broyden" if searches_field else None))
 
     @classmethod
+    @without_autocast
     def from_body(
         cls,
         body: object,
@@ -125,13 +127,24 @@ class ForwardDeformer(ForwardSkinning):
         return self._search
 
     @search.setter
-    def search(self, search: SearchConfig) -> None:
+    def search(self, search: SearchConfig | str) -> None:
+        search = as_search_config(search)
         check_search_config(search, self.num_bones)
         if self.searches_field and search.name != "broyden":
             raise ValueError(
                 f"search.name: wanted broyden for skinning.name 'mlp', got {search.name!r}: the field has no cells"
             )
         self._search = search
+
+    def extra_repr(self) -> str:
+        """Describe the deformer in the text of the module."""
+        nodes = "x".join(map(str, self.shape[::-1]))
+        return f"bones={self.num_bones}, nodes={nodes}, search={self.search.name}"
+
+    def _apply(self, fn, recurse=True):
+        if self.body is not None:
+            self.body = self.body.mapped(fn)
+        return super()._apply(fn, recurse)
 
     def node_weights(self, active_only: bool | None = None, poses: int | None = None) -> NodeWeights | None:
         """Evaluate the skinning weights at the nodes that a search reads; None for a field that is searched directly.
@@ -164,6 +177,7 @@ class ForwardDeformer(ForwardSkinning):
             weights: from `node_weights`, if they have been evaluated already.
             starts: [B, N, I, 3], canonical points from which a broyden search starts, metres; None for the start bones.
         """
+        self._check_call(points, bone_transforms)
         with torch.autocast(points.device.type, enabled=False):
             if self.searches_field:
                 if capacity is not None:
@@ -188,6 +202,15 @@ class ForwardDeformer(ForwardSkinning):
                 capacity=capacity,
                 check=not self._sums_to_one,
             )
+
+    def _check_call(self, points: Tensor, bone_transforms: Tensor) -> None:
+        """Raise TypeError for arguments that are no tensors, as in calls of other deformers, or of another dtype."""
+        for name, value in (("points", points), ("bone_transforms", bone_transforms)):
+            if not isinstance(value, Tensor):
+                wanted = "a tensor in deformer(points, bone_transforms), without further conditions"
+                raise TypeError(f"{name}: wanted {wanted}, got a {type(value).__name__}")
+            if value.is_floating_point() and value.dtype != self.lower.dtype:
+                raise TypeError(f"{name}: wanted the dtype of the deformer, {self.lower.dtype}, got {value.dtype}")
 
     def pose(self, bone_transforms: Tensor, weights: NodeWeights | None = None) -> PosedDeformer:
         """Prepare poses for many calls: the transforms are blended, and the cells sorted, once.

@@ -147,6 +147,11 @@ def check_transforms(bone_transforms: Tensor) -> None:
         return
     if not bool(bone_transforms.isfinite().all()):
         raise ValueError("bone_transforms: wanted finite numbers, got NaN or infinite ones")
+    last = bone_transforms[..., 3, :] - bone_transforms.new_tensor([0.0, 0.0, 0.0, 1.0])
+    if bool((last.abs() > 1e-3).any()):
+        row = bone_transforms[..., 3, :][(last.abs() > 1e-3).any(-1)][0].tolist()
+        came = ", ".join(f"{value:.3g}" for value in row)
+        raise ValueError(f"bone_transforms: wanted 0, 0, 0, 1 as the last row, got {came}; are they transposed?")
     turn = bone_transforms[..., :3, :3].reshape(-1, 3, 3)
     _, determinant = invert_3x3(turn)
     singular = (determinant.abs() <= 1e-9 * turn.abs().amax((1, 2)) ** 3).nonzero()[:, 0]
@@ -194,8 +199,12 @@ def check_points(points: Tensor, poses: Tensor | None = None, name: str = "point
 
 
 def check_capacity(capacity: int | None) -> None:
-    """Raise ValueError for a negative capacity."""
-    if capacity is not None and capacity < 0:
+    """Raise ValueError for a negative capacity, and TypeError for what is no number."""
+    if capacity is None:
+        return
+    if not isinstance(capacity, int | torch.SymInt):
+        raise TypeError(f"capacity: wanted a number or None, got a {type(capacity).__name__}")
+    if capacity < 0:
         raise ValueError(f"capacity: wanted 0 or more, got {capacity}")
 
 

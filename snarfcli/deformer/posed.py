@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, overload
+from typing import Any, SupportsIndex, overload
 
 import torch
 from torch import Tensor
@@ -49,6 +49,9 @@ class PosedDeformer(ABC):
             capacity: maximum number of roots to return, see `find_correspondences`; not for a field that is searched directly.
             starts: [B, N, I, 3], canonical points from which a broyden search starts, metres; None for the start bones.
         """
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
+        raise TypeError("a prepared pose cannot be copied or pickled: send the transforms, and call deformer.pose there")
 
     @property
     @abstractmethod

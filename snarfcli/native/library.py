@@ -111,8 +111,9 @@ def _find() -> Path:
     if reason:
         raise _Unavailable(f"{reason}; install a C++17 compiler ({_COMPILERS}), then reinstall snarf")
     raise _Unavailable(
-        f"there is no {_FILE_NAME} in {_folders()[0]}: snarf was not installed from there, or the library failed to build; "
-        "reinstall snarf with a C++ compiler at hand (pip install -v shows what the compiler says)"
+        f"there is no {_FILE_NAME} in {_folders()[0]}: if Python was started in the folder of the sources, which hides the "
+        "installed package, start it elsewhere; otherwise the library failed to build: reinstall snarf with a C++ compiler at "
+        "hand (pip install -v shows what the compiler says)"
     )
 
 

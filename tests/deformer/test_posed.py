@@ -252,6 +252,33 @@ def test_passes_do_not_disturb_each_other():
     assert not posed._searched.gradients._sums._by_pass
 
 
+def test_threads_go_back_through_one_pose_at_once():
+    points, transforms, weights = scene(torch.float64, angle=0.2, count=200)
+    deformer = deformer_of(weights)
+    posed = deformer.pose(transforms)
+    losses = [posed(chunk).canonical.square().sum() for chunk in points.split(50, 1)]
+    wanted = [torch.autograd.grad(loss, deformer.field.values, retain_graph=True)[0] for loss in losses]
+    passed: list[int] = []
+
+    def work(number: int) -> None:
+        for _ in range(20):
+            mine = torch.autograd.grad(losses[number], deformer.field.values, retain_graph=True)[0]
+            torch.testing.assert_close(mine, wanted[number])
+            passed.append(number)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # so that threads meet
+    try:
+        threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert len(passed) == 80
+
+
 def test_a_pass_that_fails_leaves_no_sum_behind():
     points, transforms, weights = scene()
     points.requires_grad_()

@@ -164,7 +164,7 @@ class ForwardDeformer(ForwardSkinning):
             weights: from `node_weights`, if they have been evaluated already.
             starts: [B, N, I, 3], canonical points from which a broyden search starts, metres; None for the start bones.
         """
-        with torch.autocast(points.device.type, enabled=False):
+        with torch.autocast(self.lower.device.type, enabled=False):
             if self.searches_field:
                 if capacity is not None:
                     raise ValueError(

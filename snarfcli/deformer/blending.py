@@ -97,10 +97,12 @@ def _(gradient, weights, bones, active_cells, wants_weights, wants_bones, backen
 def _save_for_backward(ctx, inputs, output):
     weights, bones, active_cells, ctx.backend = inputs
     ctx.save_for_backward(weights, bones, active_cells)
+    # Not read in the backward pass: PyTorch changes it there for an operator, though several threads may be in the same graph.
+    ctx.wants = tuple(ctx.needs_input_grad[:2])
 
 
 def _backward(ctx, gradient):
-    wants = ctx.needs_input_grad[0], ctx.needs_input_grad[1]
+    wants = ctx.wants
     v_weights, v_bones = blend_backward(gradient, *ctx.saved_tensors, *wants, ctx.backend)
     return v_weights if wants[0] else None, v_bones if wants[1] else None, None, None
 

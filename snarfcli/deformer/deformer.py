@@ -178,7 +178,7 @@ class ForwardDeformer(ForwardSkinning):
             starts: [B, N, I, 3], canonical points from which a broyden search starts, metres; None for the start bones.
         """
         self._check_call(points, bone_transforms)
-        with torch.autocast(points.device.type, enabled=False):
+        with torch.autocast(self.lower.device.type, enabled=False):
             if self.searches_field:
                 if capacity is not None:
                     raise ValueError(

@@ -147,17 +147,17 @@ def check_transforms(bone_transforms: Tensor) -> None:
         return
     if not bool(bone_transforms.isfinite().all()):
         raise ValueError("bone_transforms: wanted finite numbers, got NaN or infinite ones")
-    last = bone_transforms[..., 3, :] - bone_transforms.new_tensor([0.0, 0.0, 0.0, 1.0])
-    if bool((last.abs() > 1e-3).any()):
-        row = bone_transforms[..., 3, :][(last.abs() > 1e-3).any(-1)][0].tolist()
-        came = ", ".join(f"{value:.3g}" for value in row)
-        raise ValueError(f"bone_transforms: wanted 0, 0, 0, 1 as the last row, got {came}; are they transposed?")
     turn = bone_transforms[..., :3, :3].reshape(-1, 3, 3)
     _, determinant = invert_3x3(turn)
     singular = (determinant.abs() <= 1e-9 * turn.abs().amax((1, 2)) ** 3).nonzero()[:, 0]
     if len(singular):
         pose, bone = divmod(int(singular[0]), bone_transforms.shape[1])
         raise ValueError(f"bone_transforms: wanted invertible ones, got a singular one for bone {bone} of pose {pose}")
+    last = bone_transforms[..., 3, :] - bone_transforms.new_tensor([0.0, 0.0, 0.0, 1.0])
+    if bool((last.abs() > 1e-3).any()):
+        row = bone_transforms[..., 3, :][(last.abs() > 1e-3).any(-1)][0].tolist()
+        came = ", ".join(f"{value:.3g}" for value in row)
+        raise ValueError(f"bone_transforms: wanted 0, 0, 0, 1 as the last row, got {came}; are they transposed?")
 
 
 def check_values(grid: CanonicalGrid, bone_transforms: Tensor, skinning_weights: Tensor, active_cells: Tensor | None) -> None:

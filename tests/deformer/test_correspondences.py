@@ -299,3 +299,10 @@ def test_they_can_be_copied_and_pickled():
     for again in (copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
         assert torch.equal(again.canonical, found.canonical)
         assert bool(again.is_cut)
+
+
+def test_the_text_of_roots_is_short():
+    points, transforms, weights = scene(count=40)
+    found = find_correspondences(points, transforms, weights, unit_grid(torch.float32))
+    assert repr(found) == f"Correspondences({len(found.query)} rows for 2 x 40 points)"
+    assert found != 0

@@ -173,3 +173,33 @@ def test_points_and_segments_of_no_length_have_the_same_cells(deformer):
     shape, grid = deformer.shape, deformer.grid
     as_segments = cells_near(grid, shape, [(points[:, None].expand(-1, 2, -1), 0.1)])
     assert torch.equal(cells_near(grid, shape, [(points, 0.1)]), as_segments)
+
+
+def test_poses_and_bodies_are_exact_under_autocast():
+    """Half precision would move a vertex by millimetres."""
+    body, pose = builtin_body(), 0.3 * torch.randn(1, 24, 3, generator=torch.Generator().manual_seed(0))
+    deformer = ForwardDeformer.from_body(body)
+    assert deformer.body is not None
+    transforms, posed = deformer.body.posed_from_canonical(pose), body.pose(pose)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(deformer.body.posed_from_canonical(pose), transforms)
+        again = body.pose(pose)
+        other = ForwardDeformer.from_body(body).body
+    assert torch.equal(again.vertices, posed.vertices)
+    assert torch.equal(again.posed_from_rest, posed.posed_from_rest)
+    assert other is not None
+    assert torch.equal(other.vertices, deformer.body.vertices)
+
+
+def test_the_body_moves_with_the_deformer():
+    deformer = ForwardDeformer.from_body(builtin_body()).double()
+    body = deformer.body
+    assert body is not None
+    assert (
+        body.vertices.dtype == body.weights.dtype == body.grid.lower.dtype == body.skeleton.joints_rest.dtype == torch.float64
+    )
+    assert body.active_cells.dtype == torch.bool
+    transforms = body.posed_from_canonical(torch.zeros(1, 24, 3, dtype=torch.float64))
+    assert bool(deformer(deformer.skin(body.vertices[None, ::100], transforms), transforms).found.all())
+    assert "bones=24" in repr(deformer)
+    assert deformer.to("meta").body.vertices.device.type == "meta"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import math
 import os
+import pickle
 import subprocess
 import sys
 import threading
@@ -252,6 +254,33 @@ def test_passes_do_not_disturb_each_other():
     assert not posed._searched.gradients._sums._by_pass
 
 
+def test_threads_go_back_through_one_pose_at_once():
+    points, transforms, weights = scene(torch.float64, angle=0.2, count=200)
+    deformer = deformer_of(weights)
+    posed = deformer.pose(transforms)
+    losses = [posed(chunk).canonical.square().sum() for chunk in points.split(50, 1)]
+    wanted = [torch.autograd.grad(loss, deformer.field.values, retain_graph=True)[0] for loss in losses]
+    passed: list[int] = []
+
+    def work(number: int) -> None:
+        for _ in range(20):
+            mine = torch.autograd.grad(losses[number], deformer.field.values, retain_graph=True)[0]
+            torch.testing.assert_close(mine, wanted[number])
+            passed.append(number)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # so that threads meet
+    try:
+        threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert len(passed) == 80
+
+
 def test_a_pass_that_fails_leaves_no_sum_behind():
     points, transforms, weights = scene()
     points.requires_grad_()
@@ -469,9 +498,19 @@ def test_autocast_changes_nothing():
         torch.testing.assert_close(again, skinned, rtol=0, atol=1e-6)
 
 
+def test_it_cannot_be_copied_or_pickled():
+    _, transforms, weights = scene()
+    for deformer in (deformer_of(weights), field_deformer(torch.float32)):
+        posed = deformer.pose(transforms[:, : deformer.num_bones])
+        for work in (copy.deepcopy, pickle.dumps):
+            with pytest.raises(TypeError, match="send the transforms, and call"):
+                work(posed)
+
+
 def test_what_does_not_fit_is_named():
     """Weights as well: the native library would read beyond the end of arrays that are too small."""
     points, transforms, weights = scene()
+    turned = transforms.transpose(2, 3).contiguous()
 
     def nodes(values):
         return NodeWeights(values, unit_grid(values.dtype))
@@ -482,6 +521,11 @@ def test_what_does_not_fit_is_named():
         (lambda: deformer.pose(transforms[0]), ValueError, r"bone_transforms: wanted shape \[B, 4, 4, 4\], got \[4, 4, 4\]"),
         (lambda: deformer.pose(transforms.double()), TypeError, "bone_transforms: wanted the dtype of the deformer"),
         (lambda: deformer.pose(transforms * math.nan), ValueError, "bone_transforms: wanted finite numbers"),
+        (lambda: deformer.pose(turned), ValueError, "wanted 0, 0, 0, 1 as the last row, got .*; are they transposed"),
+        (lambda: deformer(points, turned), ValueError, "wanted 0, 0, 0, 1 as the last row, got .*; are they transposed"),
+        (lambda: deformer(points, {}, transforms, True), TypeError, r"bone_transforms: wanted a tensor in .*, got a dict"),
+        (lambda: deformer(points, transforms, {}), TypeError, "capacity: wanted a number or None, got a dict"),
+        (lambda: deformer(points.double(), transforms.double()), TypeError, "points: wanted the dtype of the deformer"),
         (lambda: posed(points[:1]), ValueError, r"points: wanted shape \[2, N, 3\] to fit the poses, got \[1, 40, 3\]"),
         (lambda: posed(points.double()), TypeError, "points: wanted the dtype of the poses"),
         (lambda: posed(points, capacity=-1), ValueError, "capacity: wanted 0 or more, got -1"),

@@ -179,9 +179,8 @@ int snarf_prepare(const snarf_field* field, int64_t poses, const uint8_t* active
   const snarf_queries queries{nullptr, poses, 0, threads};
   if (!valid(field, &queries) || !prepared || !bytes) return SNARF_BAD_ARGUMENT;
   return in_number_type(field->bytes_per_number, [&](auto number) {
-    std::unique_ptr<snarf_prepared> out(new snarf_prepared());
-    prepare<decltype(number)>(*field, poses, active, threads, *out);
-    *bytes = out->bytes;
+    std::unique_ptr<snarf_prepared> out(new Prepared<decltype(number)>(*field, poses, active, threads));
+    *bytes = out->bytes();
     *prepared = out.release();
   });
 }
@@ -189,9 +188,10 @@ int snarf_prepare(const snarf_field* field, int64_t poses, const uint8_t* active
 int snarf_take_prepared(snarf_prepared* prepared, void* buffer, void* boxes) {
   const std::unique_ptr<snarf_prepared> owner(prepared);
   if (!prepared || !buffer) return SNARF_OK;
-  std::memcpy(buffer, owner->buffer.get(), size_t(owner->bytes));
-  return in_number_type(header_of(owner->buffer.get()).bytes_per_number,
-                        [&](auto number) { copy_boxes(owner->buffer.get(), static_cast<decltype(number)*>(boxes)); });
+  try {
+    owner->write(static_cast<char*>(buffer), boxes);
+    return SNARF_OK;
+  } catch (...) { return SNARF_OUT_OF_MEMORY; }
 }
 
 int snarf_prepared_search(const void* buffer, int64_t bytes, const snarf_field* field, const snarf_queries* queries,

@@ -29,8 +29,10 @@
 
 // The object behind a handle of the C interface.
 struct snarf_prepared {
-  std::unique_ptr<char[]> buffer;
-  int64_t bytes = 0;
+  virtual ~snarf_prepared() = default;
+  virtual int64_t bytes() const = 0;
+  // Writes the buffer, and the lower and upper corner of each pose's box, [B, 2, 3].
+  virtual void write(char* buffer, void* boxes) const = 0;
 };
 
 namespace snarf {
@@ -78,14 +80,15 @@ class Cursor {
 template <class S>
 struct SortedCells {
   PreparedPose<S> pose{};
-  std::vector<CellRecord<S>> cells;
-  std::vector<S> boxes;        // half extents, [C, 3], metres
-  std::vector<int32_t> first;  // group of each bin, [bins + 1]
-  std::vector<BinGroup> groups;
+  int64_t count = 0;                       // C
+  std::unique_ptr<CellRecord<S>[]> cells;  // [C]
+  std::unique_ptr<S[]> boxes;              // half extents, [C, 3], metres
+  std::vector<int32_t> first;              // group of each bin, [bins + 1]
+  std::vector<int32_t> sizes;              // number of cells of each bin, [bins]
 
   int64_t bytes() const {
-    return aligned(sizeof pose) + aligned(int64_t(cells.size() * sizeof(CellRecord<S>))) + aligned(int64_t(first.size() * 4)) +
-           aligned(int64_t(groups.size() * sizeof(BinGroup)));
+    return aligned(sizeof pose) + aligned(count * int64_t(sizeof(CellRecord<S>))) + aligned(int64_t(first.size() * 4)) +
+           aligned(pose.groups * int64_t(sizeof(BinGroup)));
   }
   // Writes the posed box of a cell; returns false for one without a box.
   bool box(int64_t cell, S* lower, S* upper) const {
@@ -105,7 +108,7 @@ void lay_out_bins(SortedCells<S>& out) {
   std::fill(pose.upper, pose.upper + 3, -std::numeric_limits<S>::infinity());
   std::vector<S> sides;
   S lower[3], upper[3];
-  for (int64_t cell = 0; cell < int64_t(out.cells.size()); ++cell) {
+  for (int64_t cell = 0; cell < out.count; ++cell) {
     if (!out.box(cell, lower, upper)) continue;
     S side = 0;
     for (int i = 0; i < 3; ++i) {
@@ -165,7 +168,7 @@ struct TouchedBins {
 template <class S, class F>
 void each_cell(const SortedCells<S>& sorted, const F& visit) {
   S lower[3], upper[3];
-  for (int64_t cell = 0; cell < int64_t(sorted.cells.size()); ++cell) {
+  for (int64_t cell = 0; cell < sorted.count; ++cell) {
     if (!sorted.box(cell, lower, upper)) continue;
     TouchedBins touched;
     for (int i = 0; i < 3; ++i) {
@@ -178,35 +181,45 @@ void each_cell(const SortedCells<S>& sorted, const F& visit) {
   }
 }
 
-// Sorts the bounded cells of a pose into bins.
+// Counts the cells of each bin.
 template <class S>
-void sort_cells(SortedCells<S>& out) {
+void count_cells(SortedCells<S>& out) {
   lay_out_bins(out);
   PreparedPose<S>& pose = out.pose;
-  std::vector<int64_t> next(size_t(pose.bins), 0);  // number of cells of each bin, then place of its next one
+  out.sizes.assign(size_t(pose.bins), 0);
   each_cell(out, [&](int32_t, const TouchedBins& touched) {
     pose.level[touched.level].is_empty = false;
-    touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t*) { ++next[bin]; });
+    touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t*) { ++out.sizes[bin]; });
   });
   out.first.assign(size_t(pose.bins + 1), 0);
   pose.groups = 0;
   for (int64_t bin = 0; bin < pose.bins; ++bin) {
-    const int64_t groups = (next[bin] + kBlock - 1) / kBlock;
-    next[bin] = pose.groups * kBlock;
-    pose.groups += groups;
+    pose.groups += (int64_t(out.sizes[bin]) + kBlock - 1) / kBlock;
     if (pose.groups > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // 340 GB of groups
     out.first[bin + 1] = int32_t(pose.groups);
   }
-  out.groups.resize(size_t(pose.groups));
-  for (BinGroup& group : out.groups) {
-    std::memset(group.lower, 255, sizeof group.lower);
-    std::memset(group.upper, 0, sizeof group.upper);
-    std::memset(group.cell, 0, sizeof group.cell);
+}
+
+// Enters the cells into the groups of their bins.
+template <class S>
+void enter_cells(const SortedCells<S>& sorted, BinGroup* groups) {
+  const PreparedPose<S>& pose = sorted.pose;
+  std::vector<int64_t> next(size_t(pose.bins));  // place of the next cell of each bin
+  for (int64_t bin = 0; bin < pose.bins; ++bin) {
+    next[bin] = int64_t(sorted.first[bin]) * kBlock;
+    for (int64_t unused = next[bin] + sorted.sizes[bin]; unused < int64_t(sorted.first[bin + 1]) * kBlock; ++unused) {
+      BinGroup& group = groups[unused / kBlock];
+      for (int i = 0; i < 3; ++i) {
+        group.lower[i][unused % kBlock] = 255;
+        group.upper[i][unused % kBlock] = 0;
+      }
+      group.cell[unused % kBlock] = 0;
+    }
   }
-  each_cell(out, [&](int32_t cell, const TouchedBins& touched) {
+  each_cell(sorted, [&](int32_t cell, const TouchedBins& touched) {
     touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t* at) {
       const int64_t place = next[bin]++;
-      BinGroup& group = out.groups[place / kBlock];
+      BinGroup& group = groups[place / kBlock];
       const int k = int(place % kBlock);
       for (int i = 0; i < 3; ++i) {
         group.lower[i][k] = touched.lower_in(at[i], i);
@@ -228,55 +241,77 @@ inline std::vector<int32_t> cell_numbers(const snarf_field& field, const std::ve
 }
 
 template <class S>
-void prepare(const snarf_field& field, int64_t poses, const uint8_t* active, int threads, snarf_prepared& out) {
-  const std::vector<Block> blocks = active_blocks(field, active);
-  const std::vector<int32_t> numbers = cell_numbers(field, blocks);
-  std::vector<int64_t> first_cell(1, 0);  // of each block
-  for (const Block& block : blocks) first_cell.push_back(first_cell.back() + int64_t(std::bitset<32>(block.active).count()));
-  const int64_t count = int64_t(blocks.size()), cells = int64_t(numbers.size());
-  const Geometry<S> geometry = geometry_of<S>(field);
-  std::vector<SortedCells<S>> sorted(static_cast<size_t>(poses));
-  for (auto& pose : sorted) {
-    pose.cells.resize(size_t(cells));
-    pose.boxes.resize(size_t(3 * cells));
+class Prepared final : public snarf_prepared {
+ public:
+  Prepared(const snarf_field& field, int64_t poses, const uint8_t* active, int threads)
+      : threads_(threads), poses_(static_cast<size_t>(poses)) {
+    const std::vector<Block> blocks = active_blocks(field, active);
+    numbers_ = cell_numbers(field, blocks);
+    std::vector<int64_t> first_cell(1, 0);  // of each block
+    for (const Block& block : blocks) first_cell.push_back(first_cell.back() + int64_t(std::bitset<32>(block.active).count()));
+    const int64_t count = int64_t(blocks.size()), cells = int64_t(numbers_.size());
+    const Geometry<S> geometry = geometry_of<S>(field);
+    for (auto& pose : poses_) {
+      pose.count = cells;
+      pose.cells.reset(new CellRecord<S>[cells]);
+      pose.boxes.reset(new S[3 * cells]);
+    }
+    Queue bounding(poses * count, 64), counting(poses, 1);
+    run({[&](int) {
+           for (int64_t first, last; bounding.take(first, last);)
+             for (int64_t n = first; n < last; ++n) {
+               SortedCells<S>& pose = poses_[n / count];
+               const S* const transforms = static_cast<const S*>(field.transforms) + 12 * node_count(field) * (n / count);
+               const int64_t at = first_cell[n % count];
+               kernels<S>().bounds(transforms, geometry, blocks[n % count], pose.cells.get() + at, pose.boxes.get() + 3 * at);
+             }
+         },
+         [&](int) {
+           for (int64_t pose, end; counting.take(pose, end);) count_cells(poses_[pose]);
+         }});
+    header_ = {kPreparedMark, 0, poses, cells, {}, field.bytes_per_number};
+    std::copy(field.nodes, field.nodes + 3, header_.nodes);
+    header_.bytes = aligned(sizeof header_) + aligned(4 * cells) + aligned(8 * poses);
+    for (const auto& pose : poses_) {
+      at_.push_back(header_.bytes);
+      header_.bytes += pose.bytes();
+    }
   }
-  Queue bounding(poses * count, 64), sorting(poses, 1);
-  const std::vector<std::function<void(int)>> phases = {
-      [&](int) {
-        for (int64_t first, last; bounding.take(first, last);)
-          for (int64_t n = first; n < last; ++n) {
-            SortedCells<S>& pose = sorted[n / count];
-            const S* const transforms = static_cast<const S*>(field.transforms) + 12 * node_count(field) * (n / count);
-            const int64_t at = first_cell[n % count];
-            kernels<S>().bounds(transforms, geometry, blocks[n % count], pose.cells.data() + at, pose.boxes.data() + 3 * at);
-          }
-      },
-      [&](int) {
-        for (int64_t pose, end; sorting.take(pose, end);) sort_cells(sorted[pose]);
-      },
-  };
-  if (!run_phases(threads, phases)) throw std::bad_alloc();
-  PreparedHeader header{kPreparedMark, 0, poses, cells, {}, field.bytes_per_number};
-  std::copy(field.nodes, field.nodes + 3, header.nodes);
-  header.bytes = aligned(sizeof header) + aligned(4 * cells) + aligned(8 * poses);
-  std::vector<int64_t> at;
-  for (const auto& pose : sorted) {
-    at.push_back(header.bytes);
-    header.bytes += pose.bytes();
+
+  int64_t bytes() const override { return header_.bytes; }
+
+  void write(char* buffer, void* boxes) const override {
+    Cursor to(buffer);
+    to.write(&header_, 1);
+    to.write(numbers_.data(), header_.cells);
+    to.write(at_.data(), header_.poses);
+    Queue queue(header_.poses, 1);
+    run({[&](int) {
+      for (int64_t n, end; queue.take(n, end);) {
+        const SortedCells<S>& pose = poses_[n];
+        Cursor part(buffer + at_[n]);
+        part.write(&pose.pose, 1);
+        part.write(pose.cells.get(), pose.count);
+        part.write(pose.first.data(), int64_t(pose.first.size()));
+        enter_cells(pose, part.next<BinGroup>(pose.pose.groups));
+        S* const box = static_cast<S*>(boxes) + 6 * n;
+        std::copy(pose.pose.lower, pose.pose.lower + 3, box);
+        std::copy(pose.pose.upper, pose.pose.upper + 3, box + 3);
+      }
+    }});
   }
-  out.bytes = header.bytes;
-  out.buffer.reset(new char[header.bytes]);
-  Cursor to(out.buffer.get());
-  to.write(&header, 1);
-  to.write(numbers.data(), cells);
-  to.write(at.data(), poses);
-  for (const auto& pose : sorted) {
-    to.write(&pose.pose, 1);
-    to.write(pose.cells.data(), cells);
-    to.write(pose.first.data(), int64_t(pose.first.size()));
-    to.write(pose.groups.data(), int64_t(pose.groups.size()));
+
+ private:
+  void run(const std::vector<std::function<void(int)>>& phases) const {
+    if (!run_phases(threads_, phases)) throw std::bad_alloc();
   }
-}
+
+  const int threads_;
+  std::vector<SortedCells<S>> poses_;
+  std::vector<int32_t> numbers_;
+  PreparedHeader header_{};
+  std::vector<int64_t> at_;  // place of each pose's part in the buffer
+};
 
 // Whether a buffer was made for this field and these poses.
 inline bool fits(const void* buffer, int64_t bytes, const snarf_field& field, int64_t poses) {
@@ -293,17 +328,6 @@ inline Cursor part_of(const char* buffer, int64_t pose, const int32_t*& numbers)
   at.next<PreparedHeader>(1);
   numbers = at.next<int32_t>(header.cells);
   return Cursor(const_cast<char*>(buffer) + at.next<int64_t>(header.poses)[pose]);
-}
-
-// Copies the lower and upper corner of each pose's box, [B, 2, 3].
-template <class S>
-void copy_boxes(const char* buffer, S* boxes) {
-  const int32_t* numbers;
-  for (int64_t n = 0; n < header_of(buffer).poses; ++n) {
-    const PreparedPose<S>& pose = *part_of(buffer, n, numbers).template next<PreparedPose<S>>(1);
-    std::copy(pose.lower, pose.lower + 3, boxes + 6 * n);
-    std::copy(pose.upper, pose.upper + 3, boxes + 6 * n + 3);
-  }
 }
 
 // A pose of the buffer, as the kernels take it.

@@ -138,8 +138,8 @@ class FieldOnGrid(nn.Module):
     def freeze(self) -> FieldOnGrid:
         """Switch to evaluation, evaluate the weight grid once and keep it.
 
-        It is kept until the state is loaded anew, or until `train()` is called while the field has something to train: a
-        parameter that requires a gradient, or unknown ones of a plain function.
+        It is kept until a state is loaded into this module (into the field alone is not enough), or until `train()` is called
+        while the field has something to train: a parameter that requires a gradient, or unknown ones of a plain function.
 
         Raises:
             ValueError: the field depends on the pose.

@@ -186,7 +186,8 @@ class PreparedCells:
         except BaseException:
             library.snarf_take_prepared(handle, None, None)
             raise
-        library.snarf_take_prepared(handle, c_void_p(self._buffer.data_ptr()), c_void_p(self.boxes.data_ptr()))
+        results = (c_void_p(self._buffer.data_ptr()), c_void_p(self.boxes.data_ptr()))
+        _raise_for(library.snarf_take_prepared(handle, *results))
         self._place = (c_void_p(self._buffer.data_ptr()), size)
 
     @property

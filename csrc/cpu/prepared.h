@@ -32,7 +32,7 @@ struct snarf_prepared {
   virtual ~snarf_prepared() = default;
   virtual int64_t bytes() const = 0;
   // Writes the buffer, and the lower and upper corner of each pose's box, [B, 2, 3].
-  virtual void write(char* buffer, void* boxes) const = 0;
+  virtual void write(char* buffer, void* boxes) = 0;
 };
 
 namespace snarf {
@@ -84,12 +84,14 @@ struct SortedCells {
   std::unique_ptr<CellRecord<S>[]> cells;  // [C]
   std::unique_ptr<S[]> boxes;              // half extents, [C, 3], metres
   std::vector<int32_t> first;              // group of each bin, [bins + 1]
-  std::vector<int32_t> sizes;              // number of cells of each bin, [bins]
+  std::vector<std::vector<int64_t>> next;  // by chunk of cells: the place of its next cell in each bin, [bins]
 
   int64_t bytes() const {
     return aligned(sizeof pose) + aligned(count * int64_t(sizeof(CellRecord<S>))) + aligned(int64_t(first.size() * 4)) +
            aligned(pose.groups * int64_t(sizeof(BinGroup)));
   }
+  // The first cell of a chunk; chunks are counted and entered by several threads.
+  int64_t chunk_begin(int64_t chunk) const { return count * chunk / int64_t(next.size()); }
   // Writes the posed box of a cell; returns false for one without a box.
   bool box(int64_t cell, S* lower, S* upper) const {
     for (int i = 0; i < 3; ++i) {
@@ -164,11 +166,11 @@ struct TouchedBins {
   uint8_t upper_in(int32_t bin, int axis) const { return bin < last(axis) ? 255 : SNARF_ISA::place_in_bin(high[axis], level); }
 };
 
-// Calls visit(cell, touched bins) for each cell with a box, on the finest level that it fits.
+// Calls visit(cell, touched bins) for each cell of a chunk that has a box, on the finest level that it fits.
 template <class S, class F>
-void each_cell(const SortedCells<S>& sorted, const F& visit) {
+void each_cell(const SortedCells<S>& sorted, int64_t chunk, const F& visit) {
   S lower[3], upper[3];
-  for (int64_t cell = 0; cell < sorted.count; ++cell) {
+  for (int64_t cell = sorted.chunk_begin(chunk); cell < sorted.chunk_begin(chunk + 1); ++cell) {
     if (!sorted.box(cell, lower, upper)) continue;
     TouchedBins touched;
     for (int i = 0; i < 3; ++i) {
@@ -181,43 +183,47 @@ void each_cell(const SortedCells<S>& sorted, const F& visit) {
   }
 }
 
-// Counts the cells of each bin.
+// Counts the cells of a chunk in each bin, in `next`.
 template <class S>
-void count_cells(SortedCells<S>& out) {
-  lay_out_bins(out);
-  PreparedPose<S>& pose = out.pose;
-  out.sizes.assign(size_t(pose.bins), 0);
-  each_cell(out, [&](int32_t, const TouchedBins& touched) {
-    pose.level[touched.level].is_empty = false;
-    touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t*) { ++out.sizes[bin]; });
+void count_cells(SortedCells<S>& out, int64_t chunk) {
+  const PreparedPose<S>& pose = out.pose;
+  std::vector<int64_t>& sizes = out.next[chunk];
+  sizes.assign(size_t(pose.bins), 0);
+  each_cell(out, chunk, [&](int32_t, const TouchedBins& touched) {
+    touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t*) { ++sizes[bin]; });
   });
+}
+
+// Lays out the groups of all bins, and in them the cells of the chunks one after the other: counts become places.
+template <class S>
+void lay_out_groups(SortedCells<S>& out) {
+  PreparedPose<S>& pose = out.pose;
   out.first.assign(size_t(pose.bins + 1), 0);
   pose.groups = 0;
-  for (int64_t bin = 0; bin < pose.bins; ++bin) {
-    pose.groups += (int64_t(out.sizes[bin]) + kBlock - 1) / kBlock;
-    if (pose.groups > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // 340 GB of groups
-    out.first[bin + 1] = int32_t(pose.groups);
+  for (int level = 0; level < pose.levels; ++level) {
+    const int64_t groups_before = pose.groups;
+    const int64_t end = level + 1 < pose.levels ? pose.level[level + 1].bins_before : pose.bins;
+    for (int64_t bin = pose.level[level].bins_before; bin < end; ++bin) {
+      int64_t place = pose.groups * kBlock;
+      for (auto& next : out.next) {
+        const int64_t size = next[bin];
+        next[bin] = place;
+        place += size;
+      }
+      pose.groups = (place + kBlock - 1) / kBlock;
+      if (pose.groups > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // 340 GB of groups
+      out.first[bin + 1] = int32_t(pose.groups);
+    }
+    pose.level[level].is_empty = pose.groups == groups_before;
   }
 }
 
-// Enters the cells into the groups of their bins.
+// Enters the cells of a chunk into the groups of their bins.
 template <class S>
-void enter_cells(const SortedCells<S>& sorted, BinGroup* groups) {
-  const PreparedPose<S>& pose = sorted.pose;
-  std::vector<int64_t> next(size_t(pose.bins));  // place of the next cell of each bin
-  for (int64_t bin = 0; bin < pose.bins; ++bin) {
-    next[bin] = int64_t(sorted.first[bin]) * kBlock;
-    for (int64_t unused = next[bin] + sorted.sizes[bin]; unused < int64_t(sorted.first[bin + 1]) * kBlock; ++unused) {
-      BinGroup& group = groups[unused / kBlock];
-      for (int i = 0; i < 3; ++i) {
-        group.lower[i][unused % kBlock] = 255;
-        group.upper[i][unused % kBlock] = 0;
-      }
-      group.cell[unused % kBlock] = 0;
-    }
-  }
-  each_cell(sorted, [&](int32_t cell, const TouchedBins& touched) {
-    touched.each(pose.level[touched.level], [&](int64_t bin, const int32_t* at) {
+void enter_cells(SortedCells<S>& sorted, int64_t chunk, BinGroup* groups) {
+  std::vector<int64_t>& next = sorted.next[chunk];
+  each_cell(sorted, chunk, [&](int32_t cell, const TouchedBins& touched) {
+    touched.each(sorted.pose.level[touched.level], [&](int64_t bin, const int32_t* at) {
       const int64_t place = next[bin]++;
       BinGroup& group = groups[place / kBlock];
       const int k = int(place % kBlock);
@@ -228,6 +234,20 @@ void enter_cells(const SortedCells<S>& sorted, BinGroup* groups) {
       group.cell[k] = cell;
     });
   });
+}
+
+// Closes the groups that are not full, after all cells have been entered.
+template <class S>
+void close_groups(const SortedCells<S>& sorted, BinGroup* groups) {
+  for (int64_t bin = 0; bin < sorted.pose.bins; ++bin)
+    for (int64_t unused = sorted.next.back()[bin]; unused < int64_t(sorted.first[bin + 1]) * kBlock; ++unused) {
+      BinGroup& group = groups[unused / kBlock];
+      for (int i = 0; i < 3; ++i) {
+        group.lower[i][unused % kBlock] = 255;
+        group.upper[i][unused % kBlock] = 0;
+      }
+      group.cell[unused % kBlock] = 0;
+    }
 }
 
 // The numbers in the grid of the blocks' cells that are searched.
@@ -244,7 +264,9 @@ template <class S>
 class Prepared final : public snarf_prepared {
  public:
   Prepared(const snarf_field& field, int64_t poses, const uint8_t* active, int threads)
-      : threads_(threads), poses_(static_cast<size_t>(poses)) {
+      : threads_(threads),
+        chunks_(std::max<int64_t>(1, std::min<int64_t>(kMaxChunks, (threads + poses - 1) / std::max<int64_t>(poses, 1)))),
+        poses_(static_cast<size_t>(poses)) {
     const std::vector<Block> blocks = active_blocks(field, active);
     numbers_ = cell_numbers(field, blocks);
     std::vector<int64_t> first_cell(1, 0);  // of each block
@@ -255,8 +277,9 @@ class Prepared final : public snarf_prepared {
       pose.count = cells;
       pose.cells.reset(new CellRecord<S>[cells]);
       pose.boxes.reset(new S[3 * cells]);
+      pose.next.resize(size_t(chunks_));
     }
-    Queue bounding(poses * count, 64), counting(poses, 1);
+    Queue bounding(poses * count, 64), binning(poses, 1), counting(poses * chunks_, 1), grouping(poses, 1);
     run({[&](int) {
            for (int64_t first, last; bounding.take(first, last);)
              for (int64_t n = first; n < last; ++n) {
@@ -267,7 +290,13 @@ class Prepared final : public snarf_prepared {
              }
          },
          [&](int) {
-           for (int64_t pose, end; counting.take(pose, end);) count_cells(poses_[pose]);
+           for (int64_t pose, end; binning.take(pose, end);) lay_out_bins(poses_[pose]);
+         },
+         [&](int) {
+           for (int64_t n, end; counting.take(n, end);) count_cells(poses_[n / chunks_], n % chunks_);
+         },
+         [&](int) {
+           for (int64_t pose, end; grouping.take(pose, end);) lay_out_groups(poses_[pose]);
          }});
     header_ = {kPreparedMark, 0, poses, cells, {}, field.bytes_per_number};
     std::copy(field.nodes, field.nodes + 3, header_.nodes);
@@ -280,25 +309,36 @@ class Prepared final : public snarf_prepared {
 
   int64_t bytes() const override { return header_.bytes; }
 
-  void write(char* buffer, void* boxes) const override {
+  void write(char* buffer, void* boxes) override {
     Cursor to(buffer);
     to.write(&header_, 1);
     to.write(numbers_.data(), header_.cells);
     to.write(at_.data(), header_.poses);
-    Queue queue(header_.poses, 1);
+    std::vector<BinGroup*> groups;
+    std::vector<CellRecord<S>*> cells;
+    for (int64_t n = 0; n < header_.poses; ++n) {
+      const SortedCells<S>& pose = poses_[n];
+      Cursor part(buffer + at_[n]);
+      part.write(&pose.pose, 1);
+      cells.push_back(part.next<CellRecord<S>>(pose.count));
+      part.write(pose.first.data(), int64_t(pose.first.size()));
+      groups.push_back(part.next<BinGroup>(pose.pose.groups));
+      S* const box = static_cast<S*>(boxes) + 6 * n;
+      std::copy(pose.pose.lower, pose.pose.lower + 3, box);
+      std::copy(pose.pose.upper, pose.pose.upper + 3, box + 3);
+    }
+    Queue entering(header_.poses * chunks_, 1), closing(header_.poses, 1);
     run({[&](int) {
-      for (int64_t n, end; queue.take(n, end);) {
-        const SortedCells<S>& pose = poses_[n];
-        Cursor part(buffer + at_[n]);
-        part.write(&pose.pose, 1);
-        part.write(pose.cells.get(), pose.count);
-        part.write(pose.first.data(), int64_t(pose.first.size()));
-        enter_cells(pose, part.next<BinGroup>(pose.pose.groups));
-        S* const box = static_cast<S*>(boxes) + 6 * n;
-        std::copy(pose.pose.lower, pose.pose.lower + 3, box);
-        std::copy(pose.pose.upper, pose.pose.upper + 3, box + 3);
-      }
-    }});
+           for (int64_t n, end; entering.take(n, end);) {
+             SortedCells<S>& pose = poses_[n / chunks_];
+             const int64_t chunk = n % chunks_, first = pose.chunk_begin(chunk);
+             std::copy(pose.cells.get() + first, pose.cells.get() + pose.chunk_begin(chunk + 1), cells[n / chunks_] + first);
+             enter_cells(pose, chunk, groups[n / chunks_]);
+           }
+         },
+         [&](int) {
+           for (int64_t pose, end; closing.take(pose, end);) close_groups(poses_[pose], groups[pose]);
+         }});
   }
 
  private:
@@ -307,6 +347,7 @@ class Prepared final : public snarf_prepared {
   }
 
   const int threads_;
+  const int64_t chunks_;  // of each pose's cells
   std::vector<SortedCells<S>> poses_;
   std::vector<int32_t> numbers_;
   PreparedHeader header_{};

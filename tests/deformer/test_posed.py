@@ -85,6 +85,19 @@ def test_roots_are_those_of_an_unprepared_search(backend, dtype, bones, angle, s
         assert_same(posed(points[:, chunk]), deformer(points[:, chunk], transforms), tolerance)
 
 
+@pytest.mark.parametrize("threads", [1, 2, 5, 16])
+def test_roots_do_not_depend_on_the_threads_that_prepare_and_search(threads):
+    """One pose is sorted by several of them."""
+    points, transforms, weights = scene(torch.float32, 1, 5000, 24, 1.5, (16, 17, 19), 3)
+    deformer = deformer_of(weights)
+    wanted, before = deformer(points, transforms), torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        assert_same(deformer.pose(transforms)(points), wanted, 2e-5)
+    finally:
+        torch.set_num_threads(before)
+
+
 _COMPARE = """
 import sys
 sys.path[:0] = {paths!r}

@@ -216,7 +216,7 @@ class ForwardDeformer(ForwardSkinning):
         """Prepare poses for many calls: the transforms are blended, and the cells sorted, once.
 
         `posed = deformer.pose(transforms)`, then `posed(points)` returns what `deformer(points, transforms)` does. On a CPU a
-        million points in 200 calls take about as long as in one.
+        million points in 200 calls take one to three times as long as in one call; without a prepared pose, 10 to 140 times.
 
         Args:
             bone_transforms: [B, J, 4, 4], canonical to posed, metres, of the dtype and on the device of the deformer.

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
 from snarfcli.deformer.roots import Roots, drop_duplicates, invert_3x3
-from snarfcli.deformer.skinning import forward_jacobian
+from snarfcli.deformer.trilinear import forward_jacobian
 
 __all__ = ["broyden_roots"]
 

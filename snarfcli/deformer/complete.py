@@ -12,7 +12,7 @@ csrc/cpu/kernels.cpp) find the same roots.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -30,9 +30,10 @@ from snarfcli.deformer.cell_polynomials import (
     pick,
 )
 from snarfcli.deformer.grid import CORNERS, CanonicalGrid, cell_corners
+from snarfcli.deformer.posed_boxes import polynomial_boxes
 from snarfcli.deformer.roots import Roots, drop_duplicates
 
-__all__ = ["complete_roots", "posed_boxes", "posed_cell_boxes"]
+__all__ = ["complete_roots"]
 
 _QUERIES_AT_ONCE = 65_536  # bounds the memory: a query has several candidate cells
 _CELLS_AT_ONCE = 65_536  # bounds the memory: 400 bytes of corner transforms per cell, and as much per intermediate result
@@ -155,7 +156,7 @@ def complete_roots(
         poses = slice(first, first + poses_at_once)
         for some in numbers.split(_CELLS_AT_ONCE):
             cells = _cells_of(transforms[poses], some, grid, shape)
-            boxes = _posed_boxes(cells.polynomials)
+            boxes = polynomial_boxes(cells.polynomials)
             for start in range(0, count, _QUERIES_AT_ONCE):
                 queries = points[poses, start : start + _QUERIES_AT_ONCE]
                 flat, width = queries.reshape(-1, 3).T.contiguous(), queries.shape[1]
@@ -166,42 +167,6 @@ def complete_roots(
     return _sorted(found, _SAME_ROOT * float(grid.cell_size(shape).min()))
 
 
-def posed_cell_boxes(corner_transforms: Tensor, origins: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor]:
-    """Return posed-space boxes (lower [C, 3], upper [C, 3]) that contain the image of each cell, metres.
-
-    Args:
-        corner_transforms: [C, 8, 12], blended transforms at the corners of the cells.
-        origins: [C, 3], canonical position of each cell's first corner, metres.
-        cell_size: [3], metres.
-    """
-    lower, upper = _posed_boxes(cell_polynomials(corner_transforms, (origins + cell_size / 2).T, cell_size))
-    return lower.T, upper.T
-
-
-def posed_boxes(transforms: Tensor, grid: CanonicalGrid, shape: Sequence[int], active_cells: Tensor | None = None) -> Tensor:
-    """Return the lower and upper corner of a box around the images of cells in each pose, [B, 2, 3], metres.
-
-    Args:
-        transforms: [B, D * H * W, 12], blended transforms at the nodes.
-        grid: the box of the nodes.
-        shape: nodes (D, H, W).
-        active_cells: [D-1, H-1, W-1], bool; None for all.
-    """
-    depth, height, width = shape
-    cells = (torch.ones(depth - 1, height - 1, width - 1) if active_cells is None else active_cells).reshape(-1)
-    corners = cell_corners(cells.nonzero()[:, 0].to(transforms.device), shape)
-    origins = grid.nodes(shape).reshape(-1, 3)[corners[:, 0]]
-    boxes = []
-    for one in transforms:
-        parts = [
-            posed_cell_boxes(one[some], places, grid.cell_size(shape))
-            for some, places in zip(corners.split(_CELLS_AT_ONCE), origins.split(_CELLS_AT_ONCE), strict=True)
-        ]
-        lower, upper = (torch.cat(sides) for sides in zip(*parts, strict=True))
-        boxes.append(torch.stack([lower.amin(0), upper.amax(0)]))
-    return torch.stack(boxes) if boxes else transforms.new_empty(0, 2, 3)
-
-
 def _cells_of(transforms: Tensor, numbers: Tensor, grid: CanonicalGrid, shape: tuple[int, int, int]) -> _Cells:
     """Return cells in G poses, one pose after the other, from the transforms [G, D * H * W, 12] of the nodes."""
     corners, size = cell_corners(numbers, shape), grid.cell_size(shape)
@@ -209,12 +174,6 @@ def _cells_of(transforms: Tensor, numbers: Tensor, grid: CanonicalGrid, shape: t
     centres = centres.T.repeat(1, len(transforms))
     polynomials = cell_polynomials(transforms[:, corners].reshape(-1, 8, 12), centres, size)
     return _Cells(polynomials, centres, numbers.repeat(len(transforms)), size)
-
-
-def _posed_boxes(polynomials: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the boxes (lower [3, C], upper [3, C]) of cells."""
-    centre, half = polynomials[0, 0, 0], bound_boxes(polynomials)
-    return centre - half, centre + half
 
 
 def _search(points: Tensor, query: Tensor, cell: Tensor, cells: _Cells, solver: _Solver) -> Iterator[_Found]:

@@ -11,7 +11,8 @@ from torch import Tensor
 from snarfcli.deformer.callables import with_pose
 from snarfcli.deformer.centring import Centred
 from snarfcli.deformer.inference_tensors import NormalTensors
-from snarfcli.deformer.skinning import between_corners, blended_matrices, moved_vectors, trilinear_transforms
+from snarfcli.deformer.skinning import blended_matrices, moved_vectors
+from snarfcli.deformer.trilinear import between_corners, trilinear_transforms
 
 __all__ = ["ForwardMap", "check_vectors", "map_by_weights", "map_in_cells", "map_on_field"]
 

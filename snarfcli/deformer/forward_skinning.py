@@ -7,10 +7,10 @@ from typing import overload
 import torch
 from torch import Tensor
 
-from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.field_on_grid import FieldOnGrid
 from snarfcli.deformer.forward_maps import ForwardMap, check_vectors, map_by_weights, map_in_cells, map_on_field
 from snarfcli.deformer.grid_search import check_points, check_tensor
+from snarfcli.deformer.posed_boxes import posed_boxes
 from snarfcli.deformer.skinning import blend_transforms
 from snarfcli.deformer.weights import NodeWeights
 

@@ -11,7 +11,6 @@ from typing import Any, SupportsIndex, overload
 import torch
 from torch import Tensor
 
-from snarfcli.deformer.complete import posed_boxes
 from snarfcli.deformer.correspondences import Correspondences
 from snarfcli.deformer.field_search import find_correspondences_on_field
 from snarfcli.deformer.forward_maps import ForwardMap, check_vectors, map_in_cells, map_on_field
@@ -19,6 +18,7 @@ from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate
 from snarfcli.deformer.grid_search import BlendedPoses, check_capacity, check_points
 from snarfcli.deformer.implicit import add_implicit_gradient
 from snarfcli.deformer.pose_gradients import PoseGradients, corners_of_poses
+from snarfcli.deformer.posed_boxes import posed_boxes
 from snarfcli.deformer.search_config import SearchConfig
 from snarfcli.deformer.second_derivatives import differentiable_once
 from snarfcli.deformer.starts import check_starts

@@ -14,7 +14,7 @@ from snarfcli.deformer.bone_prior import BonePrior
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
 from snarfcli.deformer.harmonic import harmonic
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
-from snarfcli.deformer.skinning import interpolate
+from snarfcli.deformer.trilinear import interpolate
 from snarfcli.field_docs import documented
 from snarfcli.networks import ACTIVATIONS, WeightNormLinear, run_perceptron
 

@@ -8,8 +8,8 @@ import torch
 from skinning_scenes import random_transforms, scene, smooth_weights, unit_grid
 
 from snarfcli.deformer import SearchConfig, blend_transforms, candidates, complete, find_correspondences
-from snarfcli.deformer.complete import posed_cell_boxes
 from snarfcli.deformer.grid import cell_corners
+from snarfcli.deformer.posed_boxes import posed_cell_boxes
 
 REFERENCE = SearchConfig(backend="reference")
 

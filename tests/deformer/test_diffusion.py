@@ -11,7 +11,7 @@ from skinning_scenes import unit_grid
 
 from snarfcli.deformer import PresetWeights, diffusion
 from snarfcli.deformer.diffusion import diffuse_weights
-from snarfcli.deformer.skinning import interpolate
+from snarfcli.deformer.trilinear import interpolate
 
 
 def tube(count: int = 4000):

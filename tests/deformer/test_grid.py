@@ -10,7 +10,7 @@ from skinning_scenes import unit_grid
 
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.grid import cell_corners, locate, trilinear_weights
-from snarfcli.deformer.skinning import forward_jacobian, interpolate
+from snarfcli.deformer.trilinear import forward_jacobian, interpolate
 
 SHAPE = (3, 4, 6)
 

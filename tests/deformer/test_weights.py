@@ -8,7 +8,7 @@ from skinning_scenes import unit_grid
 
 from snarfcli.deformer import BonePrior, CanonicalGrid
 from snarfcli.deformer.hierarchy import HierarchicalSoftmax, PlainSoftmax
-from snarfcli.deformer.skinning import interpolate
+from snarfcli.deformer.trilinear import interpolate
 from snarfcli.deformer.variation import total_variation, variation, variation_reference
 from snarfcli.deformer.weights import NetworkWeights, VoxelWeights
 from snarfcli.native import cpu

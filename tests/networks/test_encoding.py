@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from snarfcli.deformer import CanonicalGrid
-from snarfcli.deformer.skinning import interpolate
+from snarfcli.deformer.trilinear import interpolate
 from snarfcli.networks.encoding import encode, encode_backward, encode_reference
 from snarfcli.shape.features import FeatureGrids
 

@@ -45,7 +45,7 @@ class _Loader(InspectLoader):
         self.original = original
 
     def create_module(self, spec: ModuleSpec) -> None:
-        """Return None, for a placeholder that nobody sees."""
+        """Return None: Python makes a module, which `exec_module` replaces."""
 
     def exec_module(self, module: ModuleType) -> None:
         sys.modules[module.__name__] = importlib.import_module(self.original.name)

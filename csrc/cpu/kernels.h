@@ -77,7 +77,7 @@ struct CompleteTask {
 template <class S>
 struct CellRecord {
   S centre[3];             // of the posed image, metres
-  S inverse[9], reach[3];  // NaN for a cell whose transforms are not finite: it has no root
+  S inverse[9], reach[3];  // the first reach is negative for a cell whose transforms are not finite: it has no root
   S curvature;
 };
 

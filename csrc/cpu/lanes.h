@@ -207,7 +207,7 @@ SNARF_HD void store(S* at, Lanes<S> value) {
   memcpy(at, &value.v, sizeof value.v);
 }
 
-// The first `count` numbers, a multiple of four, of `width` rows as so many packs, one lane per row.
+// The first `count` numbers, a multiple of four, of `width` rows, as one pack each with a lane per row.
 template <int count, class S>
 SNARF_HD void load_rows(const S* const* row, Lanes<S>* out) {
   constexpr int width = Lanes<S>::width;

@@ -11,7 +11,7 @@ from snarfcli.deformer.multigrid import Multigrid
 
 __all__ = ["harmonic"]
 
-_MOST_STEPS = 100  # a step divides the error by about four; so many are taken only where the precision does not suffice
+_MOST_STEPS = 100  # a step divides the error by about four; all are taken only where the numbers are not precise enough
 _VALUES_AT_ONCE = 2**20  # bounds the memory; columns that are solved together stay in a processor's cache
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Sequence
-from importlib.abc import InspectLoader, Loader, MetaPathFinder
+from importlib.abc import InspectLoader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from types import CodeType, ModuleType
+from typing import Any
 
 __all__ = ["share_modules"]
 
@@ -54,13 +55,14 @@ class _Loader(InspectLoader):
         return self.original.submodule_search_locations is not None
 
     def get_source(self, fullname: str) -> str | None:
-        return self._inspector().get_source(self.original.name)
+        return self._inspect("get_source")
 
     def get_code(self, fullname: str) -> CodeType | None:
-        return self._inspector().get_code(self.original.name)
+        return self._inspect("get_code")
 
-    def _inspector(self) -> InspectLoader:
-        loader: Loader | None = self.original.loader
-        if not isinstance(loader, InspectLoader):
+    def _inspect(self, method: str) -> Any:
+        """Call a method of the module's own loader, which in an editable install need not be an `InspectLoader`."""
+        function = getattr(self.original.loader, method, None)
+        if function is None:
             raise ImportError(f"the source of {self.original.name} cannot be read", name=self.original.name)
-        return loader
+        return function(self.original.name)

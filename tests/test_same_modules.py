@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import importlib
-import inspect
 import pickle
 import re
 import subprocess
@@ -92,12 +91,22 @@ def test_names_that_do_not_exist(package):
     assert find_spec(f"{package.__name__}.no_such_name") is None
 
 
-def test_the_source_can_be_inspected():
-    spec = find_spec("snarf.deformer.grid")
-    assert spec is not None
-    assert spec.origin == snarfcli.CanonicalGrid.to.__code__.co_filename
-    assert "canonical voxel grid" in spec.loader.get_source(spec.name)
-    assert "class CanonicalGrid" in inspect.getsource(snarf.CanonicalGrid)
+@pytest.mark.parametrize("is_imported", [False, True])
+def test_the_source_can_be_inspected(is_imported):
+    """Once the module is imported, the loader is the one of its own name, which depends on how the package is installed."""
+    code = f"""
+import inspect, snarf
+from importlib.util import find_spec
+if {is_imported}:
+    import snarf.deformer.grid
+spec = find_spec("snarf.deformer.grid")
+assert spec.origin == snarf.CanonicalGrid.to.__code__.co_filename
+assert "canonical voxel grid" in spec.loader.get_source(spec.name)
+assert "CanonicalGrid" in spec.loader.get_code(spec.name).co_names
+assert "class CanonicalGrid" in inspect.getsource(snarf.CanonicalGrid)
+"""
+    done = run(code)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("name", STATIC)

@@ -1,8 +1,9 @@
-// A step of Adam with a moving average of the parameters (snarfcli/training/optimizer.py).
+// A step of Adam with a moving average of the parameters (snarf/adam.h), for the rows of an array.
 #pragma once
 
 #include <math.h>
 
+#include "snarf/adam.h"
 #include "training_task.h"
 
 namespace snarf {
@@ -16,12 +17,7 @@ SNARF_HD void adam_rows(const AdamTask& task, const ParameterArray& array, int64
   float* __restrict const square = array.second + first;
   const float* __restrict const gradient = array.gradient + first;
   const float rate = array.rate * task.rate_correction;
-  for (int64_t k = 0; k < count; ++k) {
-    const float g = gradient[k];
-    mean[k] += (1.f - task.first_decay) * (g - mean[k]);
-    square[k] += (1.f - task.second_decay) * (g * g - square[k]);
-    value[k] -= rate * mean[k] / (sqrtf(square[k]) * task.root_correction + task.epsilon);
-  }
+  for (int64_t k = 0; k < count; ++k) adam_number(task, rate, gradient[k], value[k], mean[k], square[k]);
 }
 
 // Rows first to last of an array; see snarf_adam_step.
@@ -38,7 +34,7 @@ void adam(const AdamTask& task, const ParameterArray& array, int64_t first, int6
   }
   float* __restrict const average = array.average;
   const float* __restrict const value = array.values;
-  for (int64_t k = begin; k < end; ++k) average[k] += (1.f - task.average_decay) * (value[k] - average[k]);
+  for (int64_t k = begin; k < end; ++k) average_number(task, value[k], average[k]);
 }
 
 // The sum of the magnitudes of gradients; not finite if one of them is not.

@@ -11,6 +11,7 @@
 
 #include "dispatch.h"
 #include "feature_level.h"
+#include "snarf/adam.h"
 #include "snarf/api.h"
 #include "team.h"
 #include "training_task.h"
@@ -273,13 +274,8 @@ inline double adam_step(const snarf_parameters* given, int32_t count, const snar
     for (int64_t first = 0; first < array.rows; first += grain)
       parts.push_back({n, first, std::min(first + grain, array.rows)});
   }
-  AdamTask task;
-  task.first_decay = settings.first_decay;
-  task.second_decay = settings.second_decay;
-  task.epsilon = settings.epsilon;
-  task.average_decay = settings.average_decay;
-  task.rate_correction = float(1 / (1 - std::pow(double(settings.first_decay), double(settings.step))));
-  task.root_correction = float(1 / std::sqrt(1 - std::pow(double(settings.second_decay), double(settings.step))));
+  const AdamTask task = SNARF_ISA::adam_task(settings.first_decay, settings.second_decay, settings.epsilon,
+                                             settings.average_decay, settings.step);
   const TrainingKernels kernels = training_kernels();
   std::vector<double> magnitudes(parts.size());
   double total = 0;

@@ -76,12 +76,6 @@ struct ParameterArray {
   int32_t skips_untouched;  // whether rows without a gradient keep their values and moments
 };
 
-struct AdamTask {
-  float first_decay, second_decay, epsilon;
-  float rate_correction, root_correction;  // 1 / (1 - first_decay^t) and 1 / sqrt(1 - second_decay^t)
-  float average_decay;
-};
-
 struct VariationTask {
   const float* weights;  // [D, H, W, J]
   const uint8_t* used;   // [D, H, W], or null for all
@@ -100,6 +94,8 @@ struct CodeTask {
   float* out;           // [N, K]
   const float* v_out;   // the same, on the way back
 };
+
+struct AdamTask;  // snarf/adam.h
 
 struct TrainingKernels {
   // Tiles first to last.

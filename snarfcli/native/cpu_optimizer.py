@@ -51,7 +51,7 @@ def adam_step(
     epsilon: float,
     average_decay: float,
 ) -> float:
-    """Take one step of Adam in place; see `training.optimizer.adam_step_reference` for arguments and result.
+    """Take one step of Adam in place; see `training.adam.adam_step_reference` for arguments and result.
 
     All tensors are contiguous float32 on the CPU.
     """

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,12 +10,15 @@ from torch import Tensor, nn
 from snarfcli.models.file_tensors import read_tensor
 from snarfcli.native.backend import choose_backend
 from snarfcli.native.cpu_optimizer import adam_step
+from snarfcli.training.adam import adam_step_on_device, adam_step_reference
 from snarfcli.training.settings import TrainingConfig
 
-__all__ = ["AveragedAdam", "adam_step_reference"]
+__all__ = ["AveragedAdam"]
 
 _DECAYS = (0.9, 0.999)
 _EPSILON = 1e-8
+_Arrays = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor], list[Tensor]]
+"""Values, gradients, both moments and averages."""
 
 
 class AveragedAdam:
@@ -60,25 +61,54 @@ class AveragedAdam:
         Returns:
             The sum of the magnitudes of all gradients. If it is not finite, nothing has changed.
         """
-        used = [index for index, parameter in enumerate(self.parameters) if parameter.grad is not None]
-        gradients = [self.parameters[index].grad for index in used]
-        values = [self.parameters[index].detach() for index in used]
-        rates = [learning_rate * (self._config.feature_rate if self._are_features[index] else 1.0) for index in used]
-        is_native = all(v.device.type == "cpu" and v.dtype == torch.float32 and v.is_contiguous() for v in values)
+        arrays, rates, skips_untouched = self._used()
+        is_native = all(v.device.type == "cpu" and v.dtype == torch.float32 and v.is_contiguous() for v in arrays[0])
         run = adam_step if is_native and choose_backend("auto") == "native" else adam_step_reference
-        return run(
-            values,
-            [gradient.contiguous() for gradient in gradients if gradient is not None],
-            [self._first[index] for index in used],
-            [self._second[index] for index in used],
-            [self.average[index] for index in used],
-            rates,
-            [self._are_nodes[index] for index in used],
-            step + 1,
-            _DECAYS,
-            _EPSILON,
-            min(self._config.average_decay, (2 + step) / (11 + step)),
-        )
+        average_decay = min(self._config.average_decay, (2 + step) / (11 + step))
+        rates = [learning_rate * rate for rate in rates]
+        return run(*arrays, rates, skips_untouched, step + 1, _DECAYS, _EPSILON, average_decay)
+
+    @torch.no_grad()
+    def step_on_device(self, learning_rate: Tensor, step: Tensor, skip: Tensor) -> Tensor:
+        """Update as `step` does, without waiting for the device of the parameters, which holds the arguments too.
+
+        Can be captured in a CUDA graph. The graph keeps the addresses of parameters, gradients, moments and averages: it has to
+        be captured anew after `restore`, and after `follow_growth` if the model has replaced parameters.
+
+        Args:
+            learning_rate: [], float32.
+            step: [], int64, counts from 0.
+            skip: [], bool, whether to leave the update out.
+
+        Returns:
+            [], bool: whether the update was left out, by `skip` or for a gradient that is not finite. Then nothing has changed.
+
+        Raises:
+            ValueError: an argument has another shape, type or device.
+        """
+        for name, given, dtype in (
+            ("learning_rate", learning_rate, torch.float32),
+            ("step", step, torch.int64),
+            ("skip", skip, torch.bool),
+        ):
+            if given.shape or given.dtype != dtype or given.device != skip.device:
+                found = f"{[*given.shape]} {given.dtype} on {given.device}"
+                raise ValueError(f"{name}: wanted [] {dtype} on {skip.device}, got {found}")
+        arrays, rates, skips_untouched = self._used()
+        settings = (learning_rate, step, skip, _DECAYS, _EPSILON, self._config.average_decay)
+        return adam_step_on_device(*arrays, rates, skips_untouched, *settings)
+
+    def _used(self) -> tuple[_Arrays, list[float], list[bool]]:
+        """Return the arrays of the parameters that have a gradient.
+
+        Further their learning rates, as multiples of the common one, and whether rows without a gradient are kept as they are.
+        """
+        used = [index for index, parameter in enumerate(self.parameters) if parameter.grad is not None]
+        values = [self.parameters[index].detach() for index in used]
+        gradients = [parameter.grad.contiguous() for parameter in self.parameters if parameter.grad is not None]
+        first, second, average = ([kind[index] for index in used] for kind in (self._first, self._second, self.average))
+        rates = [self._config.feature_rate if self._are_features[index] else 1.0 for index in used]
+        return (values, gradients, first, second, average), rates, [self._are_nodes[index] for index in used]
 
     @torch.no_grad()
     def follow_growth(self) -> None:
@@ -130,54 +160,3 @@ class AveragedAdam:
 
 def _copy(value: Tensor) -> Tensor:
     return value.clone(memory_format=torch.contiguous_format)
-
-
-def adam_step_reference(
-    values: Sequence[Tensor],
-    gradients: Sequence[Tensor],
-    first: Sequence[Tensor],
-    second: Sequence[Tensor],
-    averages: Sequence[Tensor],
-    rates: Sequence[float],
-    skips_untouched: Sequence[bool],
-    step: int,
-    decays: tuple[float, float],
-    epsilon: float,
-    average_decay: float,
-) -> float:
-    """Take one step of Adam and of the average of the parameters in place: the readable version, for every device.
-
-    Args:
-        values: the parameters.
-        gradients: of the loss by them, of the same shapes, as are the following.
-        first, second: moments of the gradients.
-        averages: of the parameters.
-        rates: learning rate of each.
-        skips_untouched: whether rows whose gradient is all zero keep their values and moments.
-        step: 1 for the first.
-        decays: of the two moments.
-        epsilon: added to the root of the second moment.
-        average_decay: of the averages.
-
-    Returns:
-        The sum of the magnitudes of all gradients. If it is not finite, nothing has changed.
-    """
-    magnitude = float(sum(gradient.abs().sum(dtype=torch.float64) for gradient in gradients))
-    if not math.isfinite(magnitude):
-        return magnitude
-    corrections = [1 - decay**step for decay in decays]
-    for value, gradient, mean, square, average, rate, skips in zip(
-        values, gradients, first, second, averages, rates, skips_untouched, strict=True
-    ):
-        new_mean = mean.lerp(gradient, 1 - decays[0])
-        new_square = square.lerp(gradient * gradient, 1 - decays[1])
-        change = rate / corrections[0] * new_mean / ((new_square / corrections[1]).sqrt() + epsilon)
-        if skips:
-            touched = gradient.flatten(1).ne(0).any(1).reshape(-1, *[1] * (gradient.ndim - 1))
-            new_mean, new_square = torch.where(touched, new_mean, mean), torch.where(touched, new_square, square)
-            change = change * touched
-        mean.copy_(new_mean)
-        square.copy_(new_square)
-        value.sub_(change)
-        average.lerp_(value, 1 - average_decay)
-    return magnitude

@@ -63,5 +63,6 @@ def build_emulation(dtype: torch.dtype) -> ctypes.CDLL:
             raise RuntimeError(f"{' '.join(command)}\n{built.stderr}")
         loaded = ctypes.CDLL(str(library), mode=ctypes.RTLD_LOCAL)
     loaded.emulate.restype = ctypes.c_bool
-    loaded.search_bytes.restype = loaded.backward_bytes.restype = ctypes.c_size_t
+    for structure in ("search", "backward", "optimizer", "optimizer_task"):
+        getattr(loaded, f"{structure}_bytes").restype = ctypes.c_size_t
     return loaded

@@ -10,7 +10,7 @@ import torch
 
 from snarfcli.native import cuda, cuda_compile
 
-SOURCES = ("broyden", "complete", "gather", "implicit")
+SOURCES = ("broyden", "complete", "gather", "implicit", "optimizer")
 
 
 def nvrtc_problem() -> str | None:

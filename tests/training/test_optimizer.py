@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import copy
-import itertools
-import math
 
 import pytest
 import torch
+from cuda_emulation import EmulatedGpu, host_compiler
 from torch import nn
 from toy_training import training_config
 
-from snarfcli.native.cpu_optimizer import adam_step
+from snarfcli.native.cuda_optimizer import run_adam_step
 from snarfcli.shape.features import FeatureGrids
-from snarfcli.training.optimizer import AveragedAdam, adam_step_reference
+from snarfcli.training import optimizer as optimizer_module
+from snarfcli.training.optimizer import AveragedAdam
 
 
 class Model(nn.Module):
@@ -82,76 +82,6 @@ def test_a_grown_state_continues():
         assert torch.equal(one, two)
 
 
-def arrays(seed: int, dtype: torch.dtype = torch.float32) -> list[list[torch.Tensor]]:
-    """Values, gradients, both moments and averages of parameters of odd sizes; a tenth of the rows have gradients."""
-    generator = torch.Generator().manual_seed(seed)
-    shapes = [(), (3,), (17, 5), (40_001, 4), (0, 4)]
-    made = [[torch.randn(shape, generator=generator).to(dtype) for shape in shapes] for _ in range(5)]
-    made[1][3][torch.rand(40_001, generator=generator) > 0.1] = 0
-    made[3] = [second.abs() for second in made[3]]
-    return made
-
-
-def native_step(given: list[list[torch.Tensor]], threads: int) -> float:
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        return adam_step(*given, *SETTINGS)
-    finally:
-        torch.set_num_threads(before)
-
-
-SETTINGS = ([1e-2, 1e-2, 3e-2, 1e-2, 1e-2], [False, False, False, True, True], 7, (0.9, 0.999), 1e-8, 0.9)
-
-
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_native_step_equals_the_reference(threads):
-    native, wanted = arrays(0), arrays(0, torch.float64)
-    total = native_step(native, threads)
-    assert total == pytest.approx(adam_step_reference(*wanted, *SETTINGS), rel=1e-6)
-    for mine, theirs in zip(itertools.chain(*native), itertools.chain(*wanted), strict=True):
-        torch.testing.assert_close(mine, theirs.float(), rtol=2e-5, atol=2e-6)
-    untouched = (native[1][3] == 0).all(1)
-    assert 0.8 < untouched.float().mean() < 0.95
-    start = arrays(0)
-    for kind in (0, 2, 3):
-        assert torch.equal(native[kind][3][untouched], start[kind][3][untouched])
-    assert not torch.equal(native[4][3][untouched], start[4][3][untouched])  # the average follows all the same
-
-
-def test_bits_do_not_depend_on_the_number_of_threads():
-    results = []
-    for threads in (1, 2, 3):
-        given = arrays(1)
-        results.append([native_step(given, threads), given])
-    assert results[0][0] == results[1][0] == results[2][0]
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(itertools.chain(*results[0][1]), itertools.chain(*other[1]), strict=True))
-
-
-def test_the_reference_is_adam():
-    value = torch.linspace(-1, 1, 12).reshape(4, 3)
-    theirs = nn.Parameter(value.clone())
-    adam = torch.optim.Adam([theirs], lr=0.02)
-    state = [torch.zeros(4, 3), torch.zeros(4, 3), value.clone()]
-    for step in range(1, 6):
-        gradient = torch.sin(step * torch.arange(12.0)).reshape(4, 3)
-        theirs.grad = gradient.clone()
-        adam.step()
-        adam_step_reference([value], [gradient], *[[s] for s in state], [0.02], [False], step, (0.9, 0.999), 1e-8, 0.5)
-    torch.testing.assert_close(value, theirs.detach())
-
-
-@pytest.mark.parametrize("run", [adam_step_reference, adam_step])
-@pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
-def test_a_gradient_that_is_not_finite_changes_nothing(run, wrong):
-    given, before = arrays(2), arrays(2)
-    given[1][3][-1, -1] = wrong
-    assert not math.isfinite(run(*given, *SETTINGS))
-    for kind in (0, 2, 3, 4):
-        assert all(torch.equal(a, b) for a, b in zip(given[kind], before[kind], strict=True))
-
-
 def test_rows_with_new_values_start_afresh():
     model = Model()
     optimizer = AveragedAdam(model, training_config())
@@ -171,8 +101,117 @@ def test_rows_with_new_values_start_afresh():
         assert (moments[name][1][:4][~rows[:4]] != 0).any()
 
 
-def test_arrays_that_do_not_fit_are_refused():
-    given = arrays(0)
-    given[2][3] = given[2][3][:-1]
-    with pytest.raises(ValueError, match=r"parameter 3: wanted contiguous float32 \[40001, 4\]"):
-        adam_step(*given, *SETTINGS)
+# ---------------------------------------------------------------- on the device
+def emulated_step(*arguments):
+    return run_adam_step(EmulatedGpu(torch.float32), *arguments)
+
+
+@pytest.fixture(params=["operators", "kernels"])
+def way(request, monkeypatch):
+    """Let `step_on_device` run PyTorch's operators or the emulated kernels."""
+    if request.param == "kernels":
+        if host_compiler() is None:
+            pytest.skip("needs a C++ compiler")
+        monkeypatch.setattr(optimizer_module, "adam_step_on_device", emulated_step)
+    return request.param
+
+
+def on_device(optimizer: AveragedAdam, step: int, skip: bool = False) -> bool:
+    return bool(optimizer.step_on_device(torch.tensor(0.01), torch.tensor(step), torch.tensor(skip)))
+
+
+def state_of(optimizer: AveragedAdam) -> list[torch.Tensor]:
+    state = optimizer.state()
+    moments = state["optimizer"]
+    return [*map(torch.clone, optimizer.parameters), *state["average"], *moments["first"], *moments["second"]]
+
+
+def test_steps_on_the_device_equal_those_on_the_host(way):
+    """Also after growth, new values of rows, and a start from a saved state."""
+    models = Model(), Model()
+    optimizers = [AveragedAdam(model, training_config(feature_rate=3.0, average_decay=0.9)) for model in models]
+
+    def compare(first: int) -> None:
+        for step in range(first, first + 3):
+            for model, optimizer in zip(models, optimizers, strict=True):
+                optimizer.zero_gradients()
+                model.loss().backward()
+            optimizers[0].step(float(torch.tensor(0.01)), step)
+            assert not on_device(optimizers[1], step)
+        for wanted, found in zip(*map(state_of, optimizers), strict=True):
+            torch.testing.assert_close(found, wanted, rtol=3e-5, atol=1e-6)  # decays in float32 or float64
+
+    compare(0)
+    for model, optimizer in zip(models, optimizers, strict=True):
+        torch.manual_seed(1)
+        assert model.grids.cover() > 0
+        optimizer.follow_growth()
+    compare(3)
+    for model, optimizer in zip(models, optimizers, strict=True):
+        rows = torch.zeros(len(model.grids.table), dtype=torch.bool)
+        rows[[1, 4]] = True
+        with torch.no_grad():
+            model.grids.table[rows] = 0.5
+        optimizer.restart(model.grids.table, rows)
+    compare(6)
+    for optimizer in optimizers:
+        optimizer.restore(copy.deepcopy(optimizer.state()))
+    compare(9)
+
+
+def test_parameters_without_a_gradient_stay(way):
+    model = Model()
+    optimizer = AveragedAdam(model, training_config(average_decay=0.9))
+    (model.plain**2).sum().backward()
+    table = model.grids.table.detach().clone()
+    assert not on_device(optimizer, 0)
+    assert torch.equal(model.grids.table, table)
+    assert (model.plain != 1).all()
+
+
+def test_an_update_on_the_device_is_left_out(way):
+    model = Model()
+    optimizer = AveragedAdam(model, training_config(average_decay=0.9))
+    steps(model, optimizer, 2)
+    optimizer.zero_gradients()
+    model.loss().backward()
+    before = state_of(optimizer)
+    assert on_device(optimizer, 2, skip=True)
+    gradient = model.plain.grad
+    assert gradient is not None
+    gradient[1] = torch.nan
+    assert on_device(optimizer, 2)
+    assert all(torch.equal(a, b) for a, b in zip(before, state_of(optimizer), strict=True))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_parameters_of_any_layout_and_type(dtype):
+    """Such as matrices that a caller gave in transposed."""
+    model = nn.Linear(3, 5).to(dtype)
+    model.weight = nn.Parameter(model.weight.detach().t().contiguous().t())
+    twin = copy.deepcopy(model)
+    optimizers = [AveragedAdam(one, training_config()) for one in (model, twin)]
+    for step in range(3):
+        for one in (model, twin):
+            one.zero_grad()
+            one(torch.ones(2, 3, dtype=dtype)).square().sum().backward()
+        optimizers[0].step(float(torch.tensor(0.01)), step)
+        assert not on_device(optimizers[1], step)
+    for a, b in zip(*map(state_of, optimizers), strict=True):
+        torch.testing.assert_close(a, b, rtol=3e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"learning_rate": torch.tensor(0.01).double()}, r"learning_rate: wanted \[\] torch.float32 on cpu, got \[\] .*64 on"),
+        ({"step": torch.zeros(1, dtype=torch.long)}, r"step: wanted \[\] torch.int64 on cpu, got \[1\] torch.int64 on cpu"),
+        ({"skip": torch.tensor(0)}, r"skip: wanted \[\] torch.bool on cpu, got \[\] torch.int64"),
+        ({"step": torch.zeros((), dtype=torch.long, device="meta")}, r"step: wanted \[\] torch.int64 on cpu, got .* on meta"),
+    ],
+)
+def test_numbers_of_another_kind_are_refused(changed, message):
+    given = {"learning_rate": torch.tensor(0.01), "step": torch.tensor(0), "skip": torch.tensor(False)} | changed
+    optimizer = AveragedAdam(Model(), training_config())
+    with pytest.raises(ValueError, match=message):
+        optimizer.step_on_device(**given)

@@ -5,6 +5,7 @@
 #include "complete.cu"
 #include "gather.cu"
 #include "implicit.cu"
+#include "optimizer.cu"
 
 namespace {
 
@@ -38,13 +39,20 @@ const Entry<const Search<Number>> search_kernels[] = {
     {"write_roots", write_roots},
 };
 const Entry<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
+const Entry<const AdamLaunch> optimizer_kernels[] = {
+    {"check_gradients", check_gradients},
+    {"update_parameters", update_parameters},
+};
 
 }  // namespace
 
 // Returns whether there is a kernel of that name.
 extern "C" bool emulate(const char* name, const void* arguments, unsigned x, unsigned y, unsigned threads) {
   return run_named(search_kernels, name, arguments, x, y, threads) ||
-         run_named(backward_kernels, name, arguments, x, y, threads);
+         run_named(backward_kernels, name, arguments, x, y, threads) ||
+         run_named(optimizer_kernels, name, arguments, x, y, threads);
 }
 extern "C" size_t search_bytes() { return sizeof(Search<Number>); }
 extern "C" size_t backward_bytes() { return sizeof(Backward<Number>); }
+extern "C" size_t optimizer_bytes() { return sizeof(AdamLaunch); }
+extern "C" size_t optimizer_task_bytes() { return sizeof(snarf::AdamTask); }

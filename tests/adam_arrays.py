@@ -18,7 +18,10 @@ AdamArrays = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor], list[
 
 
 def adam_arrays(shapes: Sequence[Sequence[int]], seed: int, dtype: torch.dtype = torch.float32) -> AdamArrays:
-    """Return arrays of the shapes given. A tenth of the rows of matrices with more than 300 rows have gradients."""
+    """Return arrays of the shapes given.
+
+    A tenth of the rows of arrays with more than 300 rows have gradients, some of which have zeros in them.
+    """
     generator = torch.Generator().manual_seed(seed)
     values, gradients, first, second, averages = (
         [torch.randn(shape, generator=generator).to(dtype) for shape in shapes] for _ in range(5)
@@ -44,3 +47,4 @@ def _clear_rows(gradients: Sequence[Tensor], generator: torch.Generator) -> None
     for gradient in gradients:
         if gradient.ndim > 1 and len(gradient) > 300:
             gradient[torch.rand(len(gradient), generator=generator) > 0.1] = 0
+            gradient[::2, 0] = 0

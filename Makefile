@@ -72,6 +72,7 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_library.py
 	$(VENV)/bin/python benchmarks/bm_data.py
 	$(VENV)/bin/python benchmarks/bm_training.py
+	$(VENV)/bin/python benchmarks/bm_optimizer.py
 	$(VENV)/bin/python benchmarks/bm_evaluation.py
 	$(VENV)/bin/python benchmarks/bm_extraction.py
 	$(VENV)/bin/python benchmarks/bm_shape.py

@@ -1,15 +1,15 @@
 // A step of Adam, with the moving average, for all parameters of a model (adam.h), float32.
 //
-// DESIGN. The arrays stand in the kernel's argument, up to kAdamArrays at a time: a CUDA graph keeps it by value, and nothing is
-// uploaded. Each array is cut into parts of about kPartNumbers neighbouring numbers, always whole rows.
+// DESIGN. The arrays stand in the kernel's argument, up to kAdamArrays at a time: a CUDA graph keeps it by value, and nothing
+// is uploaded. Each array is cut into parts of about kPartNumbers neighbouring numbers, always whole rows.
 //   check_gradients    A limited number of blocks go through the parts. Each block writes to a flag of its own whether it met a
 //                      gradient that is not finite, so that nothing has to be zero before. The first block adds the caller's
 //                      wish to skip the step, and works out the corrections for the step once, in double precision.
 //   update_parameters  One block a part; it ends at once if any flag is set. If rows without a gradient keep their moments, one
 //                      thread a row looks for one first: rows are short, and are read again from the cache by the threads that
 //                      take one number each, side by side in memory.
-// All launches of the first kernel come before those of the second. The host's part of both is the same in every step, and the
-// result does not depend on the number of blocks or threads.
+// All launches of the first kernel come before those of the second. The arguments are the same in every step, and the result
+// does not depend on the number of blocks or threads.
 #include "snarf/adam.h"
 
 namespace snarf {

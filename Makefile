@@ -38,6 +38,7 @@ demo: $(INSTALLED)
 	@echo "meshes and video:            outputs/builtin/$(SUBJECT)/demo/animation"
 
 test: $(INSTALLED)
+	tools/fetch_nvrtc.sh $(VENV)
 	$(VENV)/bin/python -m pytest -q -n auto
 
 fuzz: $(INSTALLED)

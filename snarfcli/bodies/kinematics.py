@@ -115,6 +115,8 @@ def forward_kinematics(
 ) -> tuple[Tensor, Tensor]:
     """Pose a joint tree.
 
+    Dtype and device of the result are those of `pose`.
+
     Args:
         pose: [B, J, 3], rotation of each joint relative to its parent, axis-angle, radians; joint 0 is the global orientation.
         joints_rest: [J, 3] or [B, J, 3], joint positions in the rest pose, metres.
@@ -137,7 +139,8 @@ def forward_kinematics(
     if translation is not None and translation.shape != (batch, 3):
         raise ValueError(f"translation: wanted shape [{batch}, 3], got {list(translation.shape)}")
     _check_parents(parents)
-    rest = joints_rest.expand(batch, joints, 3)
+    rest = joints_rest.to(pose).expand(batch, joints, 3)
+    translation = None if translation is None else translation.to(pose)
     local = axis_angle_to_matrix(pose)
     rotations: list[Tensor] = []
     positions: list[Tensor] = []

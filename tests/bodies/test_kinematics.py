@@ -52,6 +52,15 @@ def test_rotation_gradients_are_exact_at_zero_and_across_the_series():
     torch.testing.assert_close(zero.grad, torch.ones(1, 3, dtype=torch.float64))
 
 
+def test_joints_and_translation_follow_the_pose_s_device_and_dtype():
+    pose = torch.zeros(2, len(PARENTS), 3, device="meta")  # a device whose tensors cannot be mixed with those of the CPU
+    rest, translation = torch.zeros(len(PARENTS), 3), torch.zeros(2, 3)
+    for result in forward_kinematics(pose, rest, PARENTS, translation):
+        assert result.device.type == "meta"
+    for result in forward_kinematics(torch.zeros(pose.shape), rest.double(), PARENTS, translation.double()):
+        assert result.dtype == torch.float32
+
+
 def reference_kinematics(pose, rest, translation):
     """One frame: global rotations, then positions, by recursion to the root."""
 

@@ -121,7 +121,7 @@ def resident_bytes() -> int:
 
 def print_machine() -> None:
     """Print the machine and the versions that the following numbers belong to."""
-    facts = machine_facts()
+    facts = machine_facts(torch.device("cuda") if torch.cuda.is_available() else None)
     machine, versions = facts["machine"], facts["versions"]
     gpu = f", {machine['gpu']}" if "gpu" in machine else ""
     print(f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads{gpu}")

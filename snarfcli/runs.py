@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import random
@@ -12,10 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from snarfcli.devices import gpus_in_turn, why_no_gpu, why_unusable
 from snarfcli.errors import UserError, nearest
 from snarfcli.versions import recorded_versions
 
-__all__ = ["choose_device", "find_avatar", "machine_facts", "run_folder", "seed_everything", "set_threads"]
+__all__ = ["check_device", "choose_device", "find_avatar", "machine_facts", "run_folder", "seed_everything", "set_threads"]
+
+log = logging.getLogger(__name__)
 
 
 def run_folder(output_root: str, data: str, subject: str, run: str) -> Path:
@@ -53,24 +57,52 @@ def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str |
     return folder / "avatar.pt"
 
 
-def choose_device(name: str) -> torch.device:
-    """Return the device named "auto" (a GPU if PyTorch sees one), "cpu", "cuda" or "cuda:N".
+def check_device(name: str) -> None:
+    """Check that a device is named "auto", "cpu", "cuda" or "cuda:N", and that PyTorch sees it. Does not start CUDA.
 
     Raises:
-        UserError: the name is unknown or PyTorch does not see the device.
+        UserError: it is not; the message states the reason.
     """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise UserError(f"device: wanted auto, cpu, cuda or cuda:N, got {name!r}") from None
-    if device.type not in ("cpu", "cuda"):
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
         raise UserError(f"device: wanted auto, cpu, cuda or cuda:N, got {name!r}")
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        seen = torch.cuda.device_count()
-        raise UserError(f"device: wanted {name}, got {seen} GPUs (PyTorch {torch.__version__}); use device=cpu")
-    return device
+    if device.type == "cuda":
+        reason, count = why_no_gpu(), torch.cuda.device_count()
+        if reason is None and (device.index or 0) >= count:
+            reason = f"PyTorch sees {count} GPU{'' if count == 1 else 's, the last one cuda:' + str(count - 1)}"
+        if reason is not None:
+            raise UserError(f"device: wanted {name}, got none, since {reason}; give device=cpu")
+
+
+def choose_device(name: str) -> torch.device:
+    """Return the device named "auto" (a GPU if one can be used), "cpu", "cuda" or "cuda:N", and make a GPU the current one.
+
+    Of several GPUs, "auto" and "cuda" take that of this process's slot (`snarfcli.slots`) or, if it cannot be used, the next.
+
+    Raises:
+        UserError: the name is unknown, or the GPU cannot be used; the message states the reason.
+    """
+    check_device(name)
+    device = torch.device("cuda" if name == "auto" else name)
+    if device.type == "cpu":
+        return device
+    reasons = [] if (reason := why_no_gpu()) is None else [reason]
+    for gpu in gpus_in_turn() if device.index is None else [device]:
+        reason = why_unusable(gpu)
+        if reason is None:
+            torch.cuda.set_device(gpu)  # for what takes no device, such as the capture of a CUDA graph
+            return gpu
+        reasons.append(reason)
+    if name != "auto":
+        raise UserError(f"device: wanted {name}, got none, since {reasons[0]}; give device=cpu")
+    if torch.version.cuda:
+        log.info("device=auto: the CPU is used, since %s", reasons[0])
+    return torch.device("cpu")
 
 
 def set_threads(threads: int | None) -> None:
@@ -88,12 +120,16 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def machine_facts() -> dict[str, Any]:
-    """Return the versions and the machine of a result, as `versions` and `machine`."""
+def machine_facts(device: torch.device | None = None) -> dict[str, Any]:
+    """Return the versions and the machine of a result, as `versions` and `machine`.
+
+    Args:
+        device: device that computed the result, if a GPU can have done so.
+    """
     machine = {"system": platform.system(), "processor": _processor(), "cores": os.cpu_count()}
     machine["threads"] = torch.get_num_threads()
-    if torch.cuda.is_available():
-        machine["gpu"] = torch.cuda.get_device_name()
+    if device is not None and device.type == "cuda":
+        machine["gpu"] = torch.cuda.get_device_name(device)
     return {"versions": recorded_versions(), "machine": machine}
 
 

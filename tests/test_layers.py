@@ -39,8 +39,8 @@ LAYERS = (
         "sampling",
         "segments",
     ),
-    ("extras", "files", "locks"),
-    ("errors", "field_docs", "interrupts", "names", "safe_start", "texts", "versions"),
+    ("devices", "extras", "files", "locks"),
+    ("errors", "field_docs", "interrupts", "names", "safe_start", "slots", "texts", "versions"),
 )
 """Folders and top-level modules of the package, from the top layer down; those of one layer do not import each other."""
 

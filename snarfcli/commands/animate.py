@@ -128,7 +128,8 @@ def _animate(
         done = len(animation.frames)
         log.info("stopped after %d of %d frames; run the same command to continue", done, count)
         raise
-    return animation, _record(config, animation, motion, path, processes, time.perf_counter() - start)
+    record = _record(config, animation, motion, path, processes, time.perf_counter() - start)
+    return animation, record | machine_facts(avatar.device)
 
 
 @dataclass(frozen=True)
@@ -245,7 +246,7 @@ def _canonical(config: AnimateConfig, avatar: Avatar) -> Mesh | None:
 def _record(
     config: AnimateConfig, animation: Animation, motion: Motion, avatar: Path, processes: int, seconds: float
 ) -> dict[str, Any]:
-    """Return the content of `animation.json`."""
+    """Return the content of `animation.json`, without the machine."""
     frames = animation.frames
     return {
         "config": asdict(config),
@@ -263,7 +264,6 @@ def _record(
             "processes": processes,
             "frames_a_second": round(len(frames) / max(seconds, 1e-9), 3),
         },
-        **machine_facts(),
     }
 
 

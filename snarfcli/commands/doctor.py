@@ -228,17 +228,22 @@ def _native() -> Finding:
 def _gpu() -> Iterator[Finding]:
     import torch
 
-    count = torch.cuda.device_count()
+    from snarfcli.devices import driver_version, why_no_gpu
+    from snarfcli.native.cuda import cuda_status
+
+    reason, count = why_no_gpu(), torch.cuda.device_count()
+    driver = driver_version()
     yield Finding("PyTorch", f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA")
-    yield Finding("devices", "none; everything runs on the CPU" if not count else f"{count}")
+    yield Finding("driver", f"for CUDA {driver[0]}.{driver[1]} and older" if driver else "none")
+    none = f"none, since {reason}; everything runs on the CPU"
+    # A CPU build of PyTorch is a choice, and a machine without a driver most likely has no GPU.
+    yield Finding("devices", none if reason else f"{count}", is_fallback=bool(reason and driver and torch.version.cuda))
     for index in range(count):
         device = torch.cuda.get_device_properties(index)
         memory = f"{device.total_memory / 2**30:.1f} GiB"
         yield Finding(f"cuda:{index}", f"{device.name}, {memory}, compute capability {device.major}.{device.minor}")
-    from snarfcli.native.cuda import cuda_status
-
     status = cuda_status()
-    yield Finding("CUDA kernels", status, is_fallback=count > 0 and status.startswith("not available"))
+    yield Finding("CUDA kernels", status, is_fallback=count > 0 and "reference" in status)
 
 
 def _tools() -> Iterator[Finding]:

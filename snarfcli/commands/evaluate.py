@@ -142,7 +142,7 @@ def _evaluate(config: EvalConfig, avatar: Avatar, path: Path, store: SampleStore
         split=config.split,
         frames=frames,
         wall_s=time.perf_counter() - start,
-        machine=machine_facts(),
+        machine=machine_facts(avatar.device),
         device=str(avatar.device),
         training=avatar.facts,
         search=asdict(search) if search else {},

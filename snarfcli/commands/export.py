@@ -115,7 +115,8 @@ class _Job:
     def record(self, place: Path, facts: dict[str, Any]) -> None:
         """Write the record of the export, which completes it."""
         seconds = round(time.perf_counter() - self.start, 2)
-        write_record(self.config, place, {"avatar": str(self.path), **facts, "seconds": seconds, **machine_facts()})
+        machine = machine_facts(self.avatar.device)
+        write_record(self.config, place, {"avatar": str(self.path), **facts, "seconds": seconds, **machine})
 
 
 _Written = tuple[list[str], tuple[tuple[str, int, str], ...]]

@@ -30,7 +30,7 @@ from snarfcli.reproduce.plans import ExperimentOptions, Job, Plan, unique_jobs
 from snarfcli.reproduce.report import write_report
 from snarfcli.reproduce.results import Result, collect
 from snarfcli.reproduce.tables import plain_table
-from snarfcli.runs import choose_device
+from snarfcli.runs import check_device
 
 __all__ = ["ReproduceConfig", "resolve_training", "run"]
 
@@ -177,7 +177,7 @@ def _check(config: ReproduceConfig) -> Launcher:
         if "=" not in one:
             raise UserError(f"launcher_settings: wanted settings such as [partition=gpu], got '{one}'")
     if config.launcher != "submitit_slurm":  # a cluster may have devices that this machine lacks
-        choose_device(config.device)
+        check_device(config.device)
     threads = config.threads
     if threads is None and config.launcher in ("joblib", "submitit_local"):
         threads = max(1, count_cores() // config.processes)

@@ -127,7 +127,7 @@ def _train(config: TrainConfig, folder: Path, trainer: Trainer) -> None:
                 "steps": trainer.step,
                 "checkpoint": (folder / "checkpoint.pt").exists(),
             }
-            write_json(folder / "metrics.json", _facts(config) | facts | machine_facts())
+            write_json(folder / "metrics.json", _facts(config) | facts | machine_facts(trainer.device))
             raise
     finished = trainer.finished_avatar()
     finished.facts |= {"steps": trainer.step, "validation": result["validation"]}
@@ -224,7 +224,7 @@ def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seco
         "steps": trainer.step,
         "refined_poses": None if trainer.refiner is None else trainer.refiner.poses.summary(),
         "timings": {"wall_s": round(seconds, 2)} | {k: v for k, v in result.items() if k != "validation"},
-        **machine_facts(),
+        **machine_facts(trainer.device),
     }
 
 

@@ -103,9 +103,9 @@ def add_implicit_gradient(
     Returns:
         The gradient by the queries, [B, N, 3]; empty if not wanted.
     """
-    device = gradient.device.type
-    native = {"cpu": cpu.implicit_backward, "cuda": cuda.implicit_backward}.get(device, implicit_backward_reference)
-    run = native if choose_backend(backend, device) == "native" else implicit_backward_reference
+    natives = {"cpu": cpu.implicit_backward, "cuda": cuda.implicit_backward}
+    native = natives.get(gradient.device.type, implicit_backward_reference)
+    run = native if choose_backend(backend, gradient.device) == "native" else implicit_backward_reference
     roots = (gradient, canonical, query, jacobian_inverse)
     return run(*roots, lower, upper, shape, batch, count, wants_points, into is not None, into)[0]
 

@@ -19,7 +19,7 @@ def register_native(operator: CustomOpDef, device_type: str, native: Callable, r
     @operator.register_kernel(device_type)
     def kernel(*arguments):
         *given, backend = arguments
-        return (native if choose_backend(backend, device_type) == "native" else reference)(*given)
+        return (native if choose_backend(backend, given[0].device) == "native" else reference)(*given)
 
 
 def grid_of(lower: Tensor, upper: Tensor, shape: Sequence[int]) -> tuple[CanonicalGrid, tuple[int, int, int]]:

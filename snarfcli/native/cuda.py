@@ -11,9 +11,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from snarfcli.native.cuda_compile import cache_folder, nvrtc_version
+from snarfcli.devices import why_no_gpu
+from snarfcli.native.backend import why_no_kernels
 from snarfcli.native.cuda_driver import gpu
 from snarfcli.native.cuda_launches import run_backward, run_broyden, run_complete
+from snarfcli.native.kernel_cache import cache_folder
+from snarfcli.native.nvrtc import nvrtc_version
 
 __all__ = ["broyden_search", "complete_search", "cuda_status", "implicit_backward"]
 
@@ -90,13 +93,23 @@ def implicit_backward(
 
 
 def cuda_status() -> str:
-    """Return one line that states whether the CUDA kernels can run here, and on what, or why not. Never raises."""
-    if not torch.version.cuda:
-        return "not available: this PyTorch is built without CUDA"
-    if not torch.cuda.is_available():
-        return "not available: PyTorch sees no CUDA device"
-    try:
-        seen = ", ".join(sorted({torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())}))
-        return f"available on {seen}; compiled on first use by NVRTC {nvrtc_version()}, kept in {cache_folder()}"
-    except (RuntimeError, OSError) as error:
-        return f"not available: {error}"
+    """Return one line that states whether the CUDA kernels can run here, and on what, or why not. Never raises.
+
+    The smallest kernel is compiled and loaded on every GPU to find out.
+    """
+    reason = why_no_gpu()
+    if reason is not None:
+        return f"not available: {reason}"
+    usable: dict[str, None] = {}  # names, each once
+    failed: dict[str, str] = {}
+    for index in range(torch.cuda.device_count()):
+        reason = why_no_kernels(torch.device("cuda", index))
+        if reason is None:
+            usable[torch.cuda.get_device_name(index)] = None
+        else:
+            failed[f"cuda:{index}"] = reason
+    without = "".join(f"; on {name} the reference in PyTorch is used: {reason}" for name, reason in failed.items())
+    if not usable:
+        return f"not available{without}"
+    kept = cache_folder() or "memory only, since there is no home folder"
+    return f"available on {', '.join(usable)}; compiled on first use by NVRTC {nvrtc_version()}, kept in {kept}{without}"

@@ -7,7 +7,6 @@ version, and eight functions of the driver are enough.
 from __future__ import annotations
 
 import ctypes
-import sys
 import threading
 from ctypes import Structure, byref, c_char_p, c_int, c_uint, c_void_p
 from functools import cache
@@ -15,9 +14,12 @@ from typing import Protocol
 
 import torch
 
+from snarfcli.devices import cuda_driver
 from snarfcli.native.cuda_compile import architecture_for, load_kernels
 
-__all__ = ["Gpu", "KernelLauncher", "gpu"]
+__all__ = ["Gpu", "KernelLauncher", "gpu", "try_kernels"]
+
+_SMALLEST = ("gather", "collect_roots")  # source and kernel; compiled in a tenth of a second
 
 
 class KernelLauncher(Protocol):
@@ -43,32 +45,33 @@ class Gpu:
         self._architecture = architecture_for(torch.cuda.get_device_capability(device))
         # PyTorch's own context: kernels and memory belong to it.
         handle, self._context = c_int(), c_void_p()
-        _check(_driver().cuInit(0))
-        _check(_driver().cuDeviceGet(byref(handle), device.index))
-        _check(_driver().cuDevicePrimaryCtxRetain(byref(self._context), handle))
+        _check(cuda_driver().cuInit(0))
+        _check(cuda_driver().cuDeviceGet(byref(handle), device.index))
+        _check(cuda_driver().cuDevicePrimaryCtxRetain(byref(self._context), handle))
 
     def threads(self, most: int) -> int:
         return most
 
     def launch(self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure) -> None:
-        function = self._function(source, kernel)
+        function = self.load(source, kernel)
         stream = c_void_p(torch.cuda.current_stream(self.device).cuda_stream)
         parameters = (c_void_p * 1)(ctypes.addressof(arguments))
         size = (c_uint(blocks[0]), c_uint(blocks[1]), c_uint(1), c_uint(threads), c_uint(1), c_uint(1))
-        _check(_driver().cuLaunchKernel(function, *size, c_uint(0), stream, parameters, None))
+        _check(cuda_driver().cuLaunchKernel(function, *size, c_uint(0), stream, parameters, None))
 
-    def _function(self, source: str, kernel: str) -> c_void_p:
+    def load(self, source: str, kernel: str) -> c_void_p:
+        """Return the handle of a kernel of csrc/cuda/<source>.cu, compiled and loaded on first use."""
         # A thread of autograd may have no context yet; inside torch.cuda.device() it would get this one.
-        _check(_driver().cuCtxSetCurrent(self._context))
+        _check(cuda_driver().cuCtxSetCurrent(self._context))
         function = self._functions.get((source, kernel))
         if function is None:
             with self._lock:
                 if source not in self._modules:
                     code, module = load_kernels(source, self.dtype, self._architecture), c_void_p()
-                    _check(_driver().cuModuleLoadData(byref(module), code))
+                    _check(cuda_driver().cuModuleLoadData(byref(module), code))
                     self._modules[source] = module
                 function = c_void_p()
-                _check(_driver().cuModuleGetFunction(byref(function), self._modules[source], kernel.encode()))
+                _check(cuda_driver().cuModuleGetFunction(byref(function), self._modules[source], kernel.encode()))
                 self._functions[source, kernel] = function
         return function
 
@@ -78,18 +81,25 @@ def gpu(tensor: torch.Tensor) -> Gpu:
     return _gpu(tensor.device.index, tensor.dtype)
 
 
+def try_kernels(device: torch.device) -> None:
+    """Compile and load the smallest kernel for a GPU, to see whether kernels can run there.
+
+    Raises:
+        RuntimeError: NVRTC is missing, does not support the GPU or cannot compile; or the driver or the GPU cannot load it.
+        OSError: the driver is not installed.
+    """
+    index = torch.cuda.current_device() if device.index is None else device.index
+    with torch.cuda.device(index):
+        _gpu(index, torch.float32).load(*_SMALLEST)
+
+
 @cache
 def _gpu(index: int, dtype: torch.dtype) -> Gpu:
     return Gpu(torch.device("cuda", index), dtype)
 
 
-@cache
-def _driver() -> ctypes.CDLL:
-    return ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
-
-
 def _check(code: int) -> None:
     if code:
         text = c_char_p()
-        _driver().cuGetErrorString(code, byref(text))
+        cuda_driver().cuGetErrorString(code, byref(text))
         raise RuntimeError(f"CUDA: {text.value.decode() if text.value else f'error {code}'}")

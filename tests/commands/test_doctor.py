@@ -6,11 +6,12 @@ import subprocess
 import sys
 
 import pytest
+from fake_gpus import FakeDriver, install_gpus
 
 from snarfcli.cli import main as cli
 from snarfcli.commands import doctor
 from snarfcli.commands.doctor import DoctorConfig
-from snarfcli.native import library
+from snarfcli.native import cuda_compile, library
 
 
 def report(caplog, data_root, output_root) -> dict[str, str]:
@@ -58,6 +59,30 @@ def test_a_fallback_is_named_with_its_reason(caplog, tmp_path, broken_library):
     lines = report(caplog, tmp_path, tmp_path)
     assert lines["native library"].startswith("not available, the reference in PyTorch is used: SNARF_NATIVE_LIBRARY names")
     assert "native library" in lines["end"]
+
+
+def test_a_driver_that_is_too_old_is_named(caplog, tmp_path, monkeypatch):
+    install_gpus(monkeypatch, [], FakeDriver(12020))
+    lines = report(caplog, tmp_path, tmp_path)
+    assert lines["driver"] == "for CUDA 12.2 and older"
+    assert lines["devices"].startswith("none, since the NVIDIA driver supports CUDA 12.2, and this PyTorch needs 13.0;")
+    assert lines["devices"].endswith("everything runs on the CPU")
+    assert "devices" in lines["end"]
+
+
+def test_kernels_that_cannot_be_compiled_are_not_available(caplog, tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("NVRTC 13.0 cannot compile gather.cu for sm_90:\nno built-in headers")
+
+    install_gpus(monkeypatch, [(9, 0)], FakeDriver())
+    monkeypatch.setattr(cuda_compile, "supported_architectures", lambda: [90])
+    monkeypatch.setattr(cuda_compile, "cache_folder", lambda: None)
+    monkeypatch.setattr(cuda_compile, "compile_kernels", fail)
+    lines = report(caplog, tmp_path, tmp_path)
+    assert lines["cuda:0"] == "GPU 0, 1.0 GiB, compute capability 9.0"
+    reason = "NVRTC 13.0 cannot compile gather.cu for sm_90: no built-in headers"
+    assert lines["CUDA kernels"] == f"not available; on cuda:0 the reference in PyTorch is used: {reason}"
+    assert "CUDA kernels" in lines["end"]
 
 
 def test_many_names_are_cut():

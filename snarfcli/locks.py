@@ -6,17 +6,19 @@ A lock is free as soon as its holder and the children that inherited it have end
 from __future__ import annotations
 
 import errno
+import itertools
 import logging
 import os
+import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-__all__ = ["can_lock", "inherited_locks", "locked", "one_of", "try_lock"]
+__all__ = ["can_lock", "hold_slot", "inherited_locks", "locked", "try_lock"]
 
 log = logging.getLogger(__name__)
 
@@ -36,23 +38,43 @@ def locked(path: Path, check: Callable[[], None] = lambda: None) -> Iterator[Non
         path: the file; it and its folder are created.
         check: called repeatedly while waiting; an exception from it ends the waiting.
     """
-    with one_of([path], check):
+    with _first_free(lambda: [path], check):
         yield
 
 
 @contextmanager
-def one_of(paths: Sequence[Path], check: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Hold the lock of any one of several files, which limits how many processes work at the same time; see `locked`."""
-    release = None
-    while release is None:
-        release = next((one for one in map(try_lock, paths) if one is not None), None)
-        if release is None:
-            check()
-            time.sleep(_LOOK_EVERY_S)
-    try:
-        yield
-    finally:
-        release()
+def hold_slot(folder: Path, most: int | None = None, check: Callable[[], None] = lambda: None) -> Iterator[int]:
+    """Hold the lowest number, from 0, that no other process of this machine holds in a folder, and yield it.
+
+    Args:
+        folder: the folder; it is created.
+        most: how many numbers there are; wait while all are held. None for any number. It limits how many processes work at
+            the same time.
+        check: as in `locked`.
+    """
+
+    def paths() -> Iterator[Path]:
+        numbers = itertools.count() if most is None else range(most)
+        return (folder / f"{socket.gethostname()}.slot{number}" for number in numbers)
+
+    with _first_free(paths, check) as slot:
+        yield slot
+
+
+@contextmanager
+def _first_free(paths: Callable[[], Iterable[Path]], check: Callable[[], None]) -> Iterator[int]:
+    """Hold the lock of the first file that no other process has locked, and yield its place; wait while all are locked."""
+    while True:
+        for place, path in enumerate(paths()):
+            release = try_lock(path)
+            if release is not None:
+                try:
+                    yield place
+                finally:
+                    release()
+                return
+        check()
+        time.sleep(_LOOK_EVERY_S)
 
 
 def try_lock(path: Path) -> Callable[[], None] | None:
@@ -96,7 +118,7 @@ def try_lock(path: Path) -> Callable[[], None] | None:
     return release
 
 
-def _is_still_there(path: Path, descriptors: Sequence[int]) -> bool:
+def _is_still_there(path: Path, descriptors: Iterable[int]) -> bool:
     """Return whether a path is still the file that was locked: its holder deletes it, while another may have opened it."""
     try:
         return all(os.path.samestat(os.fstat(descriptor), path.stat()) for descriptor in descriptors)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from snarfcli.locks import locked, one_of, try_lock
+from snarfcli.locks import hold_slot, locked, try_lock
 
 
 class Stop(Exception):
@@ -42,9 +42,18 @@ def test_the_second_waits_until_the_first_is_done(tmp_path: Path) -> None:
 
 
 def test_two_slots_take_two_and_no_third(tmp_path: Path) -> None:
-    slots = [tmp_path / "a", tmp_path / "b"]
-    with one_of(slots), one_of(slots), pytest.raises(Stop), one_of(slots, check=stop):
+    with hold_slot(tmp_path, 2) as one, hold_slot(tmp_path, 2) as two, pytest.raises(Stop), hold_slot(tmp_path, 2, stop):
         pass
+    assert (one, two) == (0, 1)
+
+
+def test_the_lowest_free_slot_is_taken_and_none_is_waited_for(tmp_path: Path) -> None:
+    with hold_slot(tmp_path / "slots") as zero:
+        with hold_slot(tmp_path / "slots") as one, hold_slot(tmp_path / "slots") as two:
+            assert (zero, one, two) == (0, 1, 2)
+        with hold_slot(tmp_path / "slots") as again:
+            assert again == 1
+    assert not list((tmp_path / "slots").iterdir())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL")

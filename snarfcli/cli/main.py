@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import snarfcli
@@ -19,6 +21,7 @@ from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 from snarfcli.interrupts import exit_code, signals_as_interrupts
+from snarfcli.slots import use_slot
 
 __all__ = ["COMMANDS", "Command", "main"]
 
@@ -156,7 +159,8 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
         try:
             if missing:
                 raise UserError(f"{', '.join(missing)}: wanted a value, got none; give {missing[0]}=VALUE")
-            codes.append(run(expand_home(OmegaConf.to_object(config))) or 0)
+            with _slot_of_job():
+                codes.append(run(expand_home(OmegaConf.to_object(config))) or 0)
         except Exception as error:  # reported here, not by Hydra; the next job of a multirun still runs
             codes.append(_report(command, error))
 
@@ -171,6 +175,22 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
     finally:
         sys.argv = before
     return max(codes, default=0)
+
+
+@contextmanager
+def _slot_of_job() -> Iterator[None]:
+    """Give a job of a multirun the lowest number that no other running job has, so that they use different GPUs."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    from snarfcli.locks import hold_slot
+
+    hydra = HydraConfig.get()
+    if hydra.mode != RunMode.MULTIRUN:
+        yield
+        return
+    with hold_slot(Path(hydra.sweep.dir)) as slot, use_slot(slot):
+        yield
 
 
 def _shown() -> list[str]:

@@ -18,7 +18,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,14 +28,24 @@ from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.interrupts import signals_as_interrupts
-from snarfcli.locks import inherited_locks, one_of, try_lock
+from snarfcli.locks import hold_slot, inherited_locks, try_lock
 from snarfcli.output_locks import hold_output, holder_is_gone, lock_file, may_be_in_use
 from snarfcli.reproduce.jobs import JobStatus, read_job_status, run_job
 from snarfcli.reproduce.plans import Job
 from snarfcli.safe_start import safe_environment, snarf_command
+from snarfcli.slots import use_slot
 from snarfcli.texts import one_line
 
-__all__ = ["LAUNCHERS", "Launcher", "check_launcher", "is_installed", "launch", "run_planned_job"]
+__all__ = [
+    "LAUNCHERS",
+    "Launcher",
+    "PlannedJobs",
+    "check_launcher",
+    "is_installed",
+    "launch",
+    "read_planned_job",
+    "run_planned_job",
+]
 
 log = logging.getLogger(__name__)
 
@@ -45,15 +55,20 @@ LAUNCHERS = ("basic", "joblib", "submitit_local", "submitit_slurm")
 _PACKAGES = {"joblib": "joblib", "submitit_local": "submitit", "submitit_slurm": "submitit"}
 _LOOK_EVERY_S = 0.5
 _MOST_SLOTS = 10_000
+_VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 _TIME_LIMIT_MIN = 7 * 24 * 60  # the default of submitit is an hour
 
 
 @dataclass(frozen=True)
-class _PlannedJobs:
+class PlannedJobs:
     """Content of a plan file."""
 
     slots: int | None
+    """How many jobs may run at a time; None where the launcher sees to it."""
     jobs: tuple[Job, ...]
+    """All jobs."""
+    visible_gpus: str | None = None
+    """CUDA_VISIBLE_DEVICES of the call; None if it was not set."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +141,8 @@ def _launch(
     jobs: Sequence[Job], work: Path, launcher: Launcher, on_change: Callable[[int, JobStatus], None]
 ) -> list[JobStatus | None]:
     """Run jobs with their files in the folder `work`, which is deleted when all have ended as planned; see `launch`."""
-    write_json(work / "plan.json", {"slots": _slots(launcher), "jobs": [asdict(job) for job in jobs]})
+    plan = PlannedJobs(_slots(launcher), tuple(jobs), os.environ.get(_VISIBLE_GPUS))
+    write_json(work / "plan.json", asdict(plan))
     said = work / "launcher.log"
     with said.open("w") as file:
         process = subprocess.Popen(
@@ -189,7 +205,7 @@ def run_planned_job(plan: Path, number: int) -> None:
     Raises:
         UserError: the plan or the job does not exist.
     """
-    job, slots = read_planned_job(plan, number)
+    job, planned = read_planned_job(plan, number)
     result, stop = plan.with_name(f"{number}.json"), plan.with_name("stop")
 
     def stopped() -> bool:
@@ -201,29 +217,44 @@ def run_planned_job(plan: Path, number: int) -> None:
         return run_job(job, stopped=stopped)
 
     try:
-        if slots is None:
+        if planned.slots is None:
             status = begin()
         else:
-            with one_of([plan.with_name(f"slot{slot}") for slot in range(slots)]):
+            with hold_slot(plan.parent, planned.slots) as slot, use_slot(slot), _see_gpus(planned.visible_gpus):
                 status = begin()
     except Exception as error:  # a fault of the program or a full disk; the other jobs still run
         status = JobStatus("failed", job.digest, stage="reproduce", reason=f"{type(error).__name__}: {one_line(error)}")
     write_json(result, asdict(status))
 
 
-def read_planned_job(plan: Path, number: int) -> tuple[Job, int | None]:
-    """Return a job of the plan in a file, and how many jobs may run at a time; None for any number.
+@contextlib.contextmanager
+def _see_gpus(visible: str | None) -> Iterator[None]:
+    """Set CUDA_VISIBLE_DEVICES, or remove it if `visible` is None, while the block runs.
+
+    submitit hides all GPUs from the jobs that it starts on this machine, unless it is told how many each of them needs.
+    """
+    before = os.environ.pop(_VISIBLE_GPUS, None)
+    os.environ.update({} if visible is None else {_VISIBLE_GPUS: visible})
+    try:
+        yield
+    finally:
+        os.environ.pop(_VISIBLE_GPUS, None)
+        os.environ.update({} if before is None else {_VISIBLE_GPUS: before})
+
+
+def read_planned_job(plan: Path, number: int) -> tuple[Job, PlannedJobs]:
+    """Return a job of the plan in a file, and the plan.
 
     Raises:
         UserError: the plan or the job does not exist, or the plan is damaged.
     """
     try:
-        content = read_described(_PlannedJobs, read_json(plan, "plan"), "plan", ignore_unknown=True)
+        content = read_described(PlannedJobs, read_json(plan, "plan"), "plan", ignore_unknown=True)
     except DescriptionError as error:
         raise UserError(f"plan {plan} is damaged ({error}); use a plan that snarf reproduce has written") from None
     if not 0 <= number < len(content.jobs) or (content.slots is not None and not 0 < content.slots <= _MOST_SLOTS):
         raise UserError(f"plan {plan} has no job {number}; use a plan that snarf reproduce has written")
-    return content.jobs[number], content.slots
+    return content.jobs[number], content
 
 
 def _arguments(work: Path, count: int, launcher: Launcher) -> list[str]:

@@ -17,10 +17,13 @@ import yaml
 from snarfcli.cli import main as cli
 from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.messages import user_message
+from snarfcli.commands import doctor
 from snarfcli.errors import UserError
 from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import quote_items, readable
 from snarfcli.hydra_config.schema import describe, group_schemas, setting_names
+from snarfcli.locks import hold_slot
+from snarfcli.slots import current_slot, use_slot
 
 COMMANDS = ("preprocess", "train", "eval", "animate", "export", "doctor", "reproduce")
 
@@ -95,7 +98,7 @@ WRONG = {
     ("train", "50002"): "wanted a setting NAME=VALUE, got '50002'",
     ("train", "subject='unclosed"): 'cannot read "subject=\'unclosed"',
     ("train", "device=gpu"): "device: wanted auto, cpu, cuda or cuda:N, got 'gpu'",
-    ("train", "device=cuda:7"): "device: wanted cuda:7, got ",
+    ("train", "device=cuda:7"): "device: wanted cuda:7, got none, since ",
     ("train", "threads=0", "data_root=none"): "threads: wanted at least 1, got 0",
     ("animate", "motion=lunges,splits"): "motion: wanted one value, got lunges,splits; give -m for one run per value, or",
     ("eval", "output_root=~nobody-has-this-name/o"): "output_root: there is no home folder ~nobody-has-this-name; give the",
@@ -145,6 +148,17 @@ def test_flags_of_hydra_may_stand_anywhere(capsys):
     code, _, err = run(capsys, "preprocess", "-m", "subject=1,2", "workers=1")
     assert code == 2
     assert "no built-in subject '1'" in err
+
+
+def test_jobs_of_a_multirun_that_run_at_the_same_time_have_different_slots(capsys, elsewhere, monkeypatch):
+    slots = []
+    monkeypatch.setattr(doctor, "run", lambda config: slots.append(current_slot()))
+    assert run(capsys, "doctor", "-m", "subject=1,2")[0] == 0
+    with hold_slot(Path("outputs/multirun")):  # of a job in another process
+        assert run(capsys, "doctor", "-m", "subject=1,2")[0] == 0
+    with use_slot(5):  # given by the user
+        assert run(capsys, "doctor")[0] == 0
+    assert slots == [0, 0, 1, 1, 5]
 
 
 def test_unwritable_and_full_folders_are_named():

@@ -16,9 +16,12 @@ import pytest
 from fake_runs import fake_plan, fake_run
 
 from snarfcli.errors import UserError
+from snarfcli.files import write_json
+from snarfcli.locks import hold_slot
 from snarfcli.reproduce import launching
 from snarfcli.reproduce.jobs import JobStatus
-from snarfcli.reproduce.launching import Launcher, check_launcher, launch, run_planned_job
+from snarfcli.reproduce.launching import Launcher, PlannedJobs, check_launcher, launch, run_planned_job
+from snarfcli.slots import current_slot, use_slot
 
 
 @pytest.mark.parametrize("name", ["basic", "joblib"])
@@ -137,6 +140,31 @@ def test_settings_reach_hydra(tmp_path):
     assert "hydra.launcher.n_jobs=2" in launching._arguments(tmp_path, 3, Launcher("joblib", 2))
     assert launching._slots(Launcher("submitit_local", 3)) == 3
     assert launching._slots(Launcher("joblib", 3)) is None
+
+
+def test_waiting_jobs_get_a_slot_when_they_start_and_see_the_gpus_of_the_call(tmp_path, monkeypatch):
+    """submitit starts all jobs at once, and sets CUDA_VISIBLE_DEVICES to nothing on this machine."""
+    jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
+    seen = []
+
+    def run_job(job, *, stopped):
+        seen.append((current_slot(), os.environ.get("CUDA_VISIBLE_DEVICES")))
+        return JobStatus("done", job.digest)
+
+    monkeypatch.setattr(launching, "run_job", run_job)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    for visible in ("2,5", None):
+        plan = PlannedJobs(3, tuple(jobs), visible)
+        write_json(tmp_path / "plan.json", asdict(plan))
+        with hold_slot(tmp_path):
+            run_planned_job(tmp_path / "plan.json", 0)
+    assert seen == [(1, "2,5"), (1, None)]
+    assert os.environ["CUDA_VISIBLE_DEVICES"] == ""
+
+    write_json(tmp_path / "plan.json", asdict(PlannedJobs(None, tuple(jobs), "2,5")))
+    with use_slot(4):  # of a launcher that starts a job when it can run, or of a cluster, which assigns GPUs itself
+        run_planned_job(tmp_path / "plan.json", 0)
+    assert seen[2:] == [(4, "")]
 
 
 def test_a_job_that_is_not_in_the_plan_is_rejected(tmp_path):

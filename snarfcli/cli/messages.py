@@ -80,6 +80,8 @@ def _file_message(error: OSError) -> str:
 
 def _memory_message(error: BaseException) -> str:
     """Return what needed too much memory, if it is known, and the next step."""
+    if "CUDA" in str(error):
+        return "not enough memory on the GPU; end other programs that use it, choose smaller sizes, or give device=cpu"
     own = one_line(error, 300) if isinstance(error, MemoryError) and str(error) else ""
     return own if ";" in own else "not enough memory; close other programs, or choose smaller sizes"
 

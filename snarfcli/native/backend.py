@@ -56,23 +56,23 @@ def why_no_kernels(device: torch.device | str) -> str | None:
 
     For a GPU the smallest kernel is compiled and loaded, once per process.
     """
-    kind, index = (device, None) if isinstance(device, str) else (device.type, device.index)
-    if kind == "cpu":
+    device = torch.device(device)
+    if device.type == "cpu":
         return why_unavailable()
-    if kind == "cuda":
-        return _why_no_cuda_kernels(index)
-    return f"there are no kernels for tensors on {kind}; move them to the CPU or to a CUDA device"
+    if device.type == "cuda":
+        return _why_no_cuda_kernels(device)
+    return f"there are no kernels for tensors on {device.type}; move them to the CPU or to a CUDA device"
 
 
 @cache
-def _why_no_cuda_kernels(index: int | None) -> str | None:
+def _why_no_cuda_kernels(gpu: torch.device) -> str | None:
     if not torch.version.cuda:
         return "this PyTorch is built without CUDA"
     reason = why_no_gpu()
     if reason is not None:
         return reason
     try:
-        try_kernels(torch.device("cuda") if index is None else torch.device("cuda", index))
+        try_kernels(gpu)
     except (RuntimeError, OSError) as error:
         return one_line(error, _LONGEST)
     return None

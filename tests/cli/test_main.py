@@ -175,6 +175,8 @@ def test_too_little_memory_is_told():
     told = "not enough memory; close other programs, or choose smaller sizes"
     assert user_message(MemoryError()) == told
     assert user_message(RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 9 bytes")) == told
+    for text in ("CUDA out of memory. Tried to allocate 2 GiB", "CUDA error: out of memory\nCUDA", "CUDA: out of memory"):
+        assert user_message(RuntimeError(text)).startswith("not enough memory on the GPU; end other programs that use it")
     own = "not enough memory to read x; close other programs"
     assert user_message(MemoryError(own)) == own
 

@@ -5,39 +5,13 @@
 
 #include "blocks.h"
 #include "network_task.h"
+#include "snarf/places.h"
 
 namespace snarf {
 namespace SNARF_ISA {
 namespace {
 
-// The cell of a level that a point lies in: rows of the features at its corners, kNoRow where there are none, and the point's
-// place between them.
-struct Place {
-  uint32_t row[8];
-  float local[3];
-  bool is_inside;
-};
-
-constexpr uint32_t kNoRow = 0xffffffffu;
 constexpr int kPlaces = 32;  // found at once, so that the features of many points are on their way from memory
-
-SNARF_HD void find_place(const FeatureLevel& level, const float* point, Place& place) {
-  int cell[3];
-  place.is_inside = false;
-  for (int axis = 0; axis < 3; ++axis) {
-    const float at = (point[axis] - level.lower[axis]) * level.per_metre[axis];
-    if (!(at >= 0.f && at <= float(level.nodes[axis] - 1))) return;
-    cell[axis] = int(at) < level.nodes[axis] - 2 ? int(at) : level.nodes[axis] - 2;
-    place.local[axis] = at - float(cell[axis]);
-  }
-  place.is_inside = true;
-  const int64_t width = level.nodes[0], layer = width * level.nodes[1];
-  const int32_t* const rows = level.rows + cell[2] * layer + cell[1] * width + cell[0];
-  for (int k = 0; k < 8; ++k) {
-    const uint32_t row = uint32_t(rows[(k >> 2) * layer + (k >> 1 & 1) * width + (k & 1)]);
-    place.row[k] = row < level.row_count ? row : kNoRow;
-  }
-}
 
 // Calls use(i, place) for each i < count with the place of points[3 * i]. Asks for the rows of `table` early.
 template <class Use>
@@ -55,16 +29,6 @@ SNARF_HD void for_places(const FeatureLevel& level, const float* points, int64_t
 #endif
     }
     for (int i = 0; i < here; ++i) use(first + i, places[i]);
-  }
-}
-
-// Trilinear weights of the eight corners.
-SNARF_HD void corner_weights(const Place& place, float* weights) {
-  const float x[2] = {1.f - place.local[0], place.local[0]};
-  for (int k = 0; k < 4; ++k) {
-    const float yz = (k & 1 ? place.local[1] : 1.f - place.local[1]) * (k >> 1 ? place.local[2] : 1.f - place.local[2]);
-    weights[2 * k] = x[0] * yz;
-    weights[2 * k + 1] = x[1] * yz;
   }
 }
 

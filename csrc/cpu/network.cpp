@@ -4,6 +4,7 @@
 #include "capsules.h"
 #include "features.h"
 #include "layer.h"
+#include "snarf/waves.h"
 
 namespace snarf {
 namespace SNARF_ISA {

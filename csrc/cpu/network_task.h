@@ -3,6 +3,8 @@
 
 #include <stdint.h>
 
+#include "snarf/places.h"
+
 namespace snarf {
 
 constexpr int kTile = 128;   // points that go through all layers together: their values stay in the second-level cache
@@ -17,15 +19,6 @@ struct NetworkLayer {
   int32_t hidden, encoded, extras;  // number of each; 0 for none
   int32_t outputs;                  // padded
   int32_t activation;               // 0: none, 1: ReLU, 2: softplus
-};
-
-// A level of feature grids.
-struct FeatureLevel {
-  float lower[3];       // of the first node, metres
-  float per_metre[3];   // cells per metre
-  int32_t nodes[3];     // W, H, D
-  const int32_t* rows;  // row of each node's features, [D, H, W]; nodes with a row that does not exist, as -1, count as zeros
-  uint32_t row_count;   // R, rows of the table
 };
 
 struct NetworkTask {

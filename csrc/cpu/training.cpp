@@ -7,6 +7,7 @@
 #include "capsules.h"
 #include "features.h"
 #include "layer.h"
+#include "snarf/waves.h"
 #include "optimizer.h"
 #include "pose_code.h"
 #include "training_task.h"

@@ -41,6 +41,7 @@ SNARF_HD float larger(float a, float b) { return a > b ? a : b; }
 SNARF_HD double larger(double a, double b) { return a > b ? a : b; }
 SNARF_HD float smaller(float a, float b) { return a < b ? a : b; }
 SNARF_HD double smaller(double a, double b) { return a < b ? a : b; }
+SNARF_HD float truncate(float a) { return float(int(a)); }
 SNARF_HD bool any(bool mask) { return mask; }
 
 // The largest absolute value of three.

@@ -1,7 +1,7 @@
 """Run compiled kernels on a GPU through the CUDA driver, on PyTorch's current stream.
 
 The driver is called through ctypes and not through the package cuda.bindings: that would be one more dependency, tied to a CUDA
-version, and eight functions of the driver are enough.
+version, and ten functions of the driver are enough.
 """
 
 from __future__ import annotations
@@ -20,17 +20,34 @@ from snarfcli.native.cuda_compile import architecture_for, load_kernels
 __all__ = ["Gpu", "KernelLauncher", "gpu", "try_kernels"]
 
 _SMALLEST = ("gather", "collect_roots")  # source and kernel; compiled in a tenth of a second
+_MOST_SHARED_BYTES = 97  # CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
+_DYNAMIC_SHARED_BYTES = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+_ALWAYS_GRANTED_BYTES = 48 * 1024
 
 
 class KernelLauncher(Protocol):
     """Interface that runs kernels: implemented by a GPU, and by the tests' emulation of one."""
 
+    capability: tuple[int, int]
+    """Compute capability, such as (9, 0)."""
+    most_shared_bytes: int
+    """Maximum shared memory of a block."""
+
     def threads(self, most: int) -> int:
         """Return the number of threads per block, at most `most`."""
         ...
 
-    def launch(self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure) -> None:
-        """Run a kernel of csrc/cuda/<source>.cu with one structure as its argument, after all earlier launches."""
+    def launch(
+        self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure, shared_bytes: int = 0
+    ) -> None:
+        """Run a kernel of csrc/cuda/<source>.cu with one structure as its argument, after all earlier launches.
+
+        Args:
+            source, kernel: names of the file and of the function.
+            blocks, threads: numbers of blocks, and of threads per block.
+            arguments: the structure.
+            shared_bytes: dynamic shared memory of a block, at most `most_shared_bytes`.
+        """
 
 
 class Gpu:
@@ -42,22 +59,32 @@ class Gpu:
         self._lock = threading.Lock()
         self._functions: dict[tuple[str, str], c_void_p] = {}
         self._modules: dict[str, c_void_p] = {}
-        self._architecture = architecture_for(torch.cuda.get_device_capability(device))
+        self._granted: dict[tuple[str, str], int] = {}  # dynamic shared memory of each kernel
+        self.capability = torch.cuda.get_device_capability(device)
+        self._architecture = architecture_for(self.capability)
         # PyTorch's own context: kernels and memory belong to it.
         handle, self._context = c_int(), c_void_p()
         _check(cuda_driver().cuInit(0))
         _check(cuda_driver().cuDeviceGet(byref(handle), device.index))
         _check(cuda_driver().cuDevicePrimaryCtxRetain(byref(self._context), handle))
+        most = c_int()
+        _check(cuda_driver().cuDeviceGetAttribute(byref(most), c_int(_MOST_SHARED_BYTES), handle))
+        self.most_shared_bytes = most.value
 
     def threads(self, most: int) -> int:
         return most
 
-    def launch(self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure) -> None:
+    def launch(
+        self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure, shared_bytes: int = 0
+    ) -> None:
         function = self.load(source, kernel)
+        if shared_bytes > self._granted.get((source, kernel), _ALWAYS_GRANTED_BYTES):
+            _check(cuda_driver().cuFuncSetAttribute(function, c_int(_DYNAMIC_SHARED_BYTES), c_int(shared_bytes)))
+            self._granted[source, kernel] = shared_bytes
         stream = c_void_p(torch.cuda.current_stream(self.device).cuda_stream)
         parameters = (c_void_p * 1)(ctypes.addressof(arguments))
         size = (c_uint(blocks[0]), c_uint(blocks[1]), c_uint(1), c_uint(threads), c_uint(1), c_uint(1))
-        _check(cuda_driver().cuLaunchKernel(function, *size, c_uint(0), stream, parameters, None))
+        _check(cuda_driver().cuLaunchKernel(function, *size, c_uint(shared_bytes), stream, parameters, None))
 
     def load(self, source: str, kernel: str) -> c_void_p:
         """Return the handle of a kernel of csrc/cuda/<source>.cu, compiled and loaded on first use."""

@@ -30,6 +30,11 @@ class WeightNormLinear(nn.Linear):
         return self.parametrizations.weight.original1
 
     @property
+    def length(self) -> nn.Parameter:
+        """[outputs, 1], of the rows of the weight."""
+        return self.parametrizations.weight.original0
+
+    @property
     def weight(self) -> Tensor:
         """[outputs, inputs], differentiable in both parameters."""
         pair = self.parametrizations.weight

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from snarfcli.networks import ACTIVATIONS, WeightNormLinear, run_encoding, run_perceptron, run_pose_code, run_segment_distance
 from snarfcli.shape.features import FeatureGrids
 
-__all__ = ["LOGITS_PER_METRE", "SOFTPLUS_SHARPNESS", "OccupancyNetwork", "ShapeConfig"]
+__all__ = ["LOGITS_PER_METRE", "SOFTPLUS_SHARPNESS", "OccupancyNetwork", "ShapeConfig", "part_codes"]
 
 SOFTPLUS_SHARPNESS = 100.0  # as in the papers' code
 LOGITS_PER_METRE = 30.0
@@ -168,9 +168,13 @@ class OccupancyNetwork(nn.Module):
         return run_encoding(canonical, self.frequencies) if len(self.frequencies) else canonical
 
 
+def part_codes(pose_code: nn.Linear, condition: Tensor, parts: int) -> Tensor:
+    """Return the code [B, P, K] of each of `parts` equal parts of a pose condition [B, C]; the bias is not in it."""
+    values = condition.unflatten(1, (parts, -1))  # [B, P, C / P]
+    mapping = pose_code.weight.unflatten(1, (parts, -1))  # [K, P, C / P]
+    return (values[:, :, None] * mapping.transpose(0, 1)).sum(-1)  # small: faster than a product of matrices
+
+
 def _local_code(pose_code: nn.Linear, condition: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
     """Return the pose code [M, K] of each point, from the parts of the condition that it sees."""
-    parts = condition.unflatten(1, (seen.shape[1], -1))  # [B, P, C / P]
-    mapping = pose_code.weight.unflatten(1, (seen.shape[1], -1))  # [K, P, C / P]
-    codes = (parts[:, :, None] * mapping.transpose(0, 1)).sum(-1)  # small: faster than a product of matrices
-    return run_pose_code(seen, codes, pose) + pose_code.bias
+    return run_pose_code(seen, part_codes(pose_code, condition, seen.shape[1]), pose) + pose_code.bias

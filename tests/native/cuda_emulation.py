@@ -21,18 +21,36 @@ _NUMBERS = {torch.float32: "float", torch.float64: "double"}
 
 
 class EmulatedGpu:
-    """A launcher whose blocks have up to `block` threads, each a thread of the operating system; 1 is fastest."""
+    """A launcher whose blocks have up to `block` threads, each a thread of the operating system; 1 is fastest.
 
-    def __init__(self, dtype: torch.dtype, block: int = 1) -> None:
-        self.library = build_emulation(dtype)
+    Args:
+        dtype: type of all numbers.
+        block: maximum number of threads of kernels that run with any number of them.
+        program: file of emulation/, without its ending: emulation for the searches, network for the network.
+    """
+
+    capability = (9, 0)
+    most_shared_bytes = 227 * 1024
+
+    def __init__(self, dtype: torch.dtype, block: int = 1, program: str = "emulation") -> None:
+        self.library = build_emulation(dtype, program)
         self.block = block
         self.launches: list[str] = []
 
     def threads(self, most: int) -> int:
         return min(most, self.block)
 
-    def launch(self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: ctypes.Structure) -> None:
+    def launch(
+        self,
+        source: str,
+        kernel: str,
+        blocks: tuple[int, int],
+        threads: int,
+        arguments: ctypes.Structure,
+        shared_bytes: int = 0,
+    ) -> None:
         self.launches.append(kernel)
+        assert shared_bytes <= self.most_shared_bytes
         assert (cuda_sources() / "cuda" / f"{source}.cu").read_text().count(f" {kernel}(") == 1
         assert min(blocks) > 0
         assert self.library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
@@ -44,25 +62,30 @@ def host_compiler() -> str | None:
     return next((path for name in (chosen, "g++", "clang++", "c++") if name and (path := shutil.which(name))), None)
 
 
-@cache
-def build_emulation(dtype: torch.dtype) -> ctypes.CDLL:
-    """Compile all kernels for one type of numbers and load them.
+def build_emulation(dtype: torch.dtype, program: str = "emulation") -> ctypes.CDLL:
+    """Compile the kernels of a program for one type of numbers and load them, once; arguments as in `EmulatedGpu`.
 
     SNARF_EMULATION_FLAGS adds flags to the compiler. Races show with
     LD_PRELOAD=$(g++ -print-file-name=libtsan.so) SNARF_EMULATION_FLAGS=-fsanitize=thread.
     """
+    return _build(dtype, program)
+
+
+@cache
+def _build(dtype: torch.dtype, program: str) -> ctypes.CDLL:
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "kernels.so"
         command = [host_compiler(), "-std=c++17", "-O2", "-g", "-shared", "-fPIC", "-pthread"]
         command += ["-Wall", "-Wextra", "-Werror", "-Wno-psabi", f"-DSNARF_NUMBER={_NUMBERS[dtype]}"]
         command += [f"-I{cuda_sources() / 'include'}", f"-I{cuda_sources() / 'cuda'}"]
         command += os.environ.get("SNARF_EMULATION_FLAGS", "").split()
-        command += ["-o", str(library), str(_FOLDER / "emulation.cpp")]
+        command += ["-o", str(library), str(_FOLDER / f"{program}.cpp")]
         built = subprocess.run(command, capture_output=True, text=True)
         if built.returncode:
             raise RuntimeError(f"{' '.join(command)}\n{built.stderr}")
         loaded = ctypes.CDLL(str(library), mode=ctypes.RTLD_LOCAL)
     loaded.emulate.restype = ctypes.c_bool
-    for structure in ("search", "backward", "optimizer", "optimizer_task"):
+    structures = ("search", "backward", "optimizer", "optimizer_task")
+    for structure in structures if program == "emulation" else ("packing", "evaluation"):
         getattr(loaded, f"{structure}_bytes").restype = ctypes.c_size_t
     return loaded

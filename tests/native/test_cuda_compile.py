@@ -11,7 +11,8 @@ import torch
 from snarfcli.native import cuda, cuda_compile
 from snarfcli.native.kernel_cache import read_cached
 
-SOURCES = ("broyden", "complete", "gather", "implicit", "optimizer")
+SOURCES = ("broyden", "complete", "gather", "implicit", "network", "optimizer")
+FLOAT32_ONLY = ("network",)  # whatever the type of numbers of the others
 
 
 def nvrtc_problem() -> str | None:
@@ -29,13 +30,20 @@ needs_nvrtc = pytest.mark.skipif(nvrtc_problem() is not None, reason=str(nvrtc_p
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("architecture", ["sm_80", "sm_90", "sm_120"])
 def test_nvrtc_compiles_every_kernel(architecture, dtype):
-    for source in SOURCES:
+    for source in SOURCES if dtype == torch.float32 else [name for name in SOURCES if name not in FLOAT32_ONLY]:
         code = cuda_compile.compile_kernels(source, dtype, architecture)
         assert code[:4] == b"\x7fELF"
         text = (cuda_compile.cuda_sources() / "cuda" / f"{source}.cu").read_text()
         kernels = re.findall(r'extern "C" __global__ void .*\b(\w+)\(const', text)
         assert kernels
         assert all(f".text.{kernel}".encode() in code for kernel in kernels)
+
+
+@needs_nvrtc
+def test_the_network_compiles_without_tensor_cores():
+    code = cuda_compile.compile_kernels("network", torch.float32, "sm_75")
+    assert b".text.evaluate_float32_64" in code
+    assert b"tf32" not in code
 
 
 def test_every_source_is_compiled_and_opens_with_its_design():

@@ -1,5 +1,5 @@
-// All kernels of csrc/cuda on the CPU, for one type of numbers (SNARF_NUMBER).
-#include "cuda_shim.h"
+// The kernels of csrc/cuda but those of the network on the CPU, for one type of numbers (SNARF_NUMBER).
+#include "entries.h"
 
 #include "broyden.cu"
 #include "complete.cu"
@@ -10,23 +10,6 @@
 namespace {
 
 using namespace snarf::device;
-
-template <class Arguments>
-struct Entry {
-  const char* name;
-  void (*kernel)(Arguments);
-};
-
-template <class Arguments, size_t count>
-bool run_named(const Entry<Arguments> (&entries)[count], const char* name, const void* arguments, unsigned x, unsigned y,
-               unsigned threads) {
-  for (const auto& entry : entries)
-    if (!strcmp(entry.name, name)) {
-      run_grid(entry.kernel, *static_cast<const Arguments*>(arguments), x, y, threads);
-      return true;
-    }
-  return false;
-}
 
 const Entry<const Search<Number>> search_kernels[] = {
     {"survey", survey},

@@ -29,6 +29,7 @@ from snarfcli.files import remove_temporaries, write_json
 from snarfcli.fitting import PoseRefiner, refined_poses_text, require_refinable
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.output_locks import hold_output
+from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.store import SampleStore
@@ -81,6 +82,9 @@ class EvalConfig:
     """auto, cpu, cuda or cuda:N."""
     threads: int | None = MISSING
     """Threads for tensor work; null keeps PyTorch's choice."""
+    precision: str = "highest"
+    """Precision of the shape network on a GPU: highest (float32), high or medium (TF32) or bfloat16. On a CPU the native
+    library computes in float32."""
     seed: int = MISSING
     """Seed of the selection of points."""
     experiment: str | None = None
@@ -101,7 +105,7 @@ def run(config: EvalConfig) -> None:
     seed_everything(config.seed)
     store = SampleStore.open(config.data_root, config.data.name, config.subject)
     sequences = store.sequences(STORE_SPLITS[config.split])
-    avatar = Avatar.load(path, device)
+    avatar = Avatar.load(path, device).with_precision(config.precision)
     _check_match(avatar, store, config)
     if config.search is not None:
         try:
@@ -179,6 +183,7 @@ def _evaluate(config: EvalConfig, avatar: Avatar, path: Path, store: SampleStore
 def _check(config: EvalConfig) -> None:
     """Check all settings before any work starts."""
     check_choice("split", config.split, SPLITS)
+    check_choice("precision", config.precision, PRECISIONS)
     least = {
         "max_frames": 1, "points": 2, "surface_frames": 0, "surface_resolution": 16, "figure_frames": 1,
         "figure_resolution": 16, "seed": 0,

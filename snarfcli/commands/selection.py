@@ -20,6 +20,7 @@ from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, 
 from snarfcli.motions.layouts import HANDS, SMPL, layout_of
 from snarfcli.motions.rig_rest import check_rest
 from snarfcli.motions.up_axis import UPS, Up
+from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, find_avatar, run_folder, set_threads
 from snarfcli.samples.stored_motion import stored_motion
 
@@ -60,6 +61,9 @@ class AvatarSelection:
     """auto, cpu, cuda or cuda:N."""
     threads: int | None = MISSING
     """Threads for tensor work; null keeps PyTorch's choice."""
+    precision: str = "high"
+    """Precision of the shape network on a GPU: highest (float32), high or medium (TF32: vertices move by hundredths of a
+    millimetre) or bfloat16 (by tenths). On a CPU the native library computes in float32."""
 
 
 @dataclass
@@ -115,8 +119,9 @@ def load_selected_avatar(choice: AvatarSelection) -> tuple[Avatar, Path]:
     """Load the selected avatar on its device; return it and its file. Sets the number of threads.
 
     Raises:
-        UserError: the avatar does not exist or cannot be used, or the device does not exist.
+        UserError: the avatar does not exist or cannot be used, the device does not exist, or the precision is unknown.
     """
+    check_choice("precision", choice.precision, PRECISIONS)
     trained_on = choice.data.avatars or choice.data.name
     subject_folder = run_folder(choice.output_root, trained_on, choice.subject, choice.run).parent
     unknown = choice.data.name == "builtin" and choice.subject not in BUILTIN_SUBJECTS
@@ -125,7 +130,7 @@ def load_selected_avatar(choice: AvatarSelection) -> tuple[Avatar, Path]:
     path = find_avatar(choice.output_root, trained_on, choice.subject, choice.run, choice.ckpt)
     device = choose_device(choice.device)
     set_threads(choice.threads)
-    return Avatar.load(path, device), path
+    return Avatar.load(path, device).with_precision(choice.precision), path
 
 
 def check_motion_selection(choice: MotionSelection) -> None:

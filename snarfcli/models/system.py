@@ -149,7 +149,7 @@ class System(nn.Module):
             canonical: [M, 3], metres.
             condition: [B, C].
             pose: [M], index of each point's pose.
-            precision: of the network; no effect where the native library evaluates it, which is in full float32 and faster.
+            precision: of the network; no effect where the native library evaluates it on a CPU, in full float32 and faster.
             weights: skinning weights of the points [M, J], used if `depends_on_weights`; None to evaluate them here.
         """
         seen = None
@@ -158,7 +158,7 @@ class System(nn.Module):
                 weights = self.skinning_weights(canonical) if weights is None else weights
             seen = self.seen_joints(weights)
         if can_evaluate(self.shape, canonical):
-            return evaluate(self.shape, canonical, condition, pose, seen)
+            return evaluate(self.shape, canonical, condition, pose, seen, precision)
         with network_precision(precision, canonical.device):
             if torch.is_grad_enabled():
                 return self.shape(canonical, condition, pose, seen).to(canonical.dtype)

@@ -31,6 +31,7 @@ from snarfcli.models.pose_onet import PoseONet
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.smpl_nn import SmplNN
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
+from snarfcli.precision import PRECISIONS
 from snarfcli.texts import one_line
 
 __all__ = ["SYSTEMS", "TrainedField"]
@@ -69,6 +70,8 @@ class TrainedField:
     Raises:
         ValueError: the configuration is not of a system, or does not fit the skeleton.
     """
+
+    _precision = "highest"  # of the shape network, see `with_precision`
 
     def __init__(
         self,
@@ -182,6 +185,26 @@ class TrainedField:
         other.model, other.facts, other._derived = model, copy.deepcopy(self.facts), {}
         return other
 
+    def with_precision(self, precision: str) -> Self:
+        """Return a copy whose shape network computes in another precision, and with it queries, meshes and exports.
+
+        It shares the model. On a CPU the native library computes in float32, whatever the precision.
+
+        Args:
+            precision: of products on a GPU: "highest" (float32), "high" or "medium" (TF32) or "bfloat16".
+
+        Raises:
+            ValueError: it is none of these.
+        """
+        other = self.with_model(self.model)
+        other._precision = _checked(precision)
+        return other
+
+    @property
+    def precision(self) -> str:
+        """Precision of the shape network, see `with_precision`."""
+        return self._precision
+
     @property
     def device(self) -> torch.device:
         """Device on which the avatar computes."""
@@ -219,14 +242,22 @@ class TrainedField:
             raise ValueError("pose: wanted finite values, got NaN or infinite ones")
         return self.skeleton.posed_from_canonical(pose, translation).to(self.device)
 
-    def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor) -> FieldSamples:
+    def query(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, precision: str | None = None) -> FieldSamples:
         """Evaluate the posed field at points [B, N, 3] under bone transforms [B, J, 4, 4] and pose [B, J, 3].
 
         Points are evaluated in parts: besides the result, 13 bytes per point, it needs less than 1 GiB for any number of them.
+
+        Args:
+            points, bone_transforms, pose: posed points and the transforms, metres; axis-angle, radians.
+            precision: of the shape network, see `with_precision`; None for the avatar's. Correspondences are always found in
+                float32.
+
+        Raises:
+            ValueError: the precision is unknown.
         """
 
         def evaluate(points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
-            values = self.shape_at(self.find(points, bone_transforms, pose), pose)
+            values = self.shape_at(self.find(points, bone_transforms, pose), pose, precision)
             return values.logits, values.found, values.counts
 
         return FieldSamples(*queries_in_parts(evaluate, points, bone_transforms, pose))
@@ -237,9 +268,10 @@ class TrainedField:
         return self.model.find(points.to(self.device), bone_transforms.to(self.device), pose.to(self.device))
 
     @torch.no_grad()
-    def shape_at(self, found: Found, pose: Tensor) -> FieldSamples:
+    def shape_at(self, found: Found, pose: Tensor, precision: str | None = None) -> FieldSamples:
         """Evaluate the shape network where `find` has led, the second half of `query`."""
-        return self.model.shape_at(found, pose.to(self.device))
+        chosen = self._precision if precision is None else _checked(precision)
+        return self.model.shape_at(found, pose.to(self.device), chosen)
 
     def occupancy(self, points: Tensor, pose: Tensor, translation: Tensor | None = None) -> Tensor:
         """Return occupancy probabilities [B, N] at posed points [B, N, 3], metres.
@@ -252,8 +284,8 @@ class TrainedField:
             translation: [B, 3], metres.
         """
 
-        def evaluate(*part: Tensor) -> tuple[Tensor, ...]:
-            return (self.query(*part).logits,)
+        def evaluate(points: Tensor, bone_transforms: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+            return (self.query(points, bone_transforms, pose).logits,)
 
         return queries_in_parts(evaluate, points, self.bone_transforms(pose, translation), pose)[0].sigmoid_()
 
@@ -273,7 +305,7 @@ class TrainedField:
         def evaluate(points: Tensor) -> Tensor:
             points = points.to(self.device)
             searched = self.model.is_searched(points).nonzero()[:, 0]
-            values = self.model.canonical_logits(points[searched], condition, torch.zeros_like(searched))
+            values = self.model.canonical_logits(points[searched], condition, torch.zeros_like(searched), self._precision)
             return points.new_full((len(points),), NO_CORRESPONDENCE).index_copy(0, searched, values)
 
         return points_in_parts(evaluate, canonical)
@@ -297,6 +329,12 @@ class TrainedField:
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
         """Return the corners (lower [3], upper [3]) of a box that holds the whole body in one pose [J, 4, 4], metres."""
         return self.model.posed_box(bone_transforms.to(self.device))
+
+
+def _checked(precision: str) -> str:
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision: wanted one of {', '.join(PRECISIONS)}, got {precision!r}")
+    return precision
 
 
 def _describe_template(template: MeshTemplate) -> dict[str, Tensor]:

@@ -184,6 +184,7 @@ def test_an_avatar_of_another_skeleton_is_rejected(config, store):
         ({"search": SearchConfig(name="broiden")}, "search.name: wanted .* did you mean 'broyden'"),
         ({"search": SearchConfig(name="broyden", init_bones=[7])}, r"search.init_bones: wanted bones from 0 to 1, got \[7\]"),
         ({"seed": -1}, "seed: wanted at least 0"),
+        ({"precision": "hihg"}, "precision: wanted highest, high, medium or bfloat16, got 'hihg'; did you mean 'high'"),
         ({"search": SearchConfig(jacobian="broiden")}, "search.jacobian: wanted exact or broyden, .* did you mean 'broyden'"),
         ({"search": SearchConfig(jacobian="broyden")}, "search.jacobian=broyden is for search=broyden"),
         ({"search": SearchConfig(tolerance=0.0)}, "search.tolerance: wanted a positive number"),

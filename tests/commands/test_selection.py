@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from snarfcli.bodies import SMPL_JOINT_NAMES, Skeleton, legs_apart_pose
 from snarfcli.commands import selection
-from snarfcli.commands.selection import AvatarSelection, MotionSelection, check_motion_selection, select_motion
+from snarfcli.commands.selection import (
+    AvatarSelection,
+    MotionSelection,
+    check_motion_selection,
+    load_selected_avatar,
+    select_motion,
+)
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.motions import Motion, read_motion
@@ -100,3 +107,12 @@ def test_what_cannot_be_used_is_rejected(skeleton, walk):
     ):
         with pytest.raises(UserError, match=message):
             check_motion_selection(replace(PLAIN, **changes))
+
+
+def test_an_avatar_gets_the_precision_of_the_command():
+    path = Path(__file__).parents[1] / "golden" / "avatar.pt"
+    choice = replace(AVATAR, ckpt=str(path))
+    assert load_selected_avatar(choice)[0].precision == "high"  # moves no vertex by more than 0.02 mm at resolution 256
+    assert load_selected_avatar(replace(choice, precision="bfloat16"))[0].precision == "bfloat16"
+    with pytest.raises(UserError, match="precision: wanted highest, high, medium or bfloat16, got 'single'"):
+        load_selected_avatar(replace(choice, precision="single"))

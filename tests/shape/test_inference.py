@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from snarfcli.native.library import build_note, instruction_set, native_library
-from snarfcli.shape import OccupancyNetwork, ShapeConfig
+from snarfcli.shape import OccupancyNetwork, ShapeConfig, inference
 from snarfcli.shape.inference import can_evaluate, evaluate
 
 PARTS = 5
@@ -72,6 +72,20 @@ def test_agrees_with_the_network(name, local):
     assert mine < max(2 * float(torchs), 2e-6)
 
 
+@pytest.mark.parametrize(("name", "local"), CASES)
+def test_a_gpu_is_asked_for_the_same_network(name, local):
+    """Here the operator of a GPU runs as on a CPU, which is its readable version."""
+    network = network_of(CONFIGS[name])
+    generator = torch.Generator().manual_seed(1)
+    points, condition = torch.rand(50, 3, generator=generator), torch.randn(3, 3 * PARTS, generator=generator)
+    pose = torch.arange(50) % 3
+    seen = torch.rand(len(points), PARTS, generator=generator) if local else None
+    with torch.no_grad():
+        wanted = network(points, condition, pose, seen)
+        got = inference._evaluate_on_gpu(network, points, condition, pose, seen, "highest")
+    torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 1000])
 def test_a_point_does_not_depend_on_the_others(count):
     network = network_of(SMALL)
@@ -122,6 +136,15 @@ def test_conditions_for_the_native_evaluation():
         assert not can_evaluate(network, points.double())
         assert not can_evaluate(network.double(), points)
         assert not can_evaluate(torch.nn.Linear(3, 1), points)
+
+
+@pytest.mark.parametrize(("backend", "expected"), [("native", True), ("reference", False)])
+def test_a_gpu_evaluates_natively_where_it_has_kernels(backend, expected, monkeypatch):
+    asked = []
+    monkeypatch.setattr(inference, "choose_backend", lambda *question: asked.append(question) or backend)
+    assert inference._has_kernels(torch.device("cuda", 1)) == expected
+    assert asked == [("auto", "cuda")]
+    assert not inference._has_kernels(torch.device("meta"))
 
 
 @pytest.mark.parametrize("name", ["avx2", "baseline"])

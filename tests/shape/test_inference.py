@@ -142,8 +142,9 @@ def test_conditions_for_the_native_evaluation():
 def test_a_gpu_evaluates_natively_where_it_has_kernels(backend, expected, monkeypatch):
     asked = []
     monkeypatch.setattr(inference, "choose_backend", lambda *question: asked.append(question) or backend)
-    assert inference._has_kernels(torch.device("cuda", 1)) == expected
-    assert asked == [("auto", "cuda")]
+    gpu = torch.device("cuda", 1)
+    assert inference._has_kernels(gpu) == expected
+    assert asked == [("auto", gpu)]
     assert not inference._has_kernels(torch.device("meta"))
 
 

@@ -18,22 +18,20 @@ __all__ = ["EmulatedGpu", "build_emulation", "host_compiler"]
 
 _FOLDER = Path(__file__).parent / "emulation"
 _NUMBERS = {torch.float32: "float", torch.float64: "double"}
+_PROGRAMS = {"network": "network"}  # files of emulation/ with the kernels of a source; emulation.cpp has those of the others
 
 
 class EmulatedGpu:
     """A launcher whose blocks have up to `block` threads, each a thread of the operating system; 1 is fastest.
 
-    Args:
-        dtype: type of all numbers.
-        block: maximum number of threads of kernels that run with any number of them.
-        program: file of emulation/, without its ending: emulation for the searches, network for the network.
+    Blocks of the network have as many as on a GPU.
     """
 
     capability = (9, 0)
     most_shared_bytes = 227 * 1024
 
-    def __init__(self, dtype: torch.dtype, block: int = 1, program: str = "emulation") -> None:
-        self.library = build_emulation(dtype, program)
+    def __init__(self, dtype: torch.dtype, block: int = 1) -> None:
+        self.dtype = dtype
         self.block = block
         self.launches: list[str] = []
 
@@ -53,7 +51,8 @@ class EmulatedGpu:
         assert shared_bytes <= self.most_shared_bytes
         assert (cuda_sources() / "cuda" / f"{source}.cu").read_text().count(f" {kernel}(") == 1
         assert min(blocks) > 0
-        assert self.library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
+        library = build_emulation(self.dtype, _PROGRAMS.get(source, "emulation"))
+        assert library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
 
 
 def host_compiler() -> str | None:
@@ -63,7 +62,11 @@ def host_compiler() -> str | None:
 
 
 def build_emulation(dtype: torch.dtype, program: str = "emulation") -> ctypes.CDLL:
-    """Compile the kernels of a program for one type of numbers and load them, once; arguments as in `EmulatedGpu`.
+    """Compile the kernels of a program for one type of numbers and load them, once.
+
+    Args:
+        dtype: type of all numbers.
+        program: file of emulation/, without its ending.
 
     SNARF_EMULATION_FLAGS adds flags to the compiler. Races show with
     LD_PRELOAD=$(g++ -print-file-name=libtsan.so) SNARF_EMULATION_FLAGS=-fsanitize=thread.

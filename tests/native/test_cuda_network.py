@@ -80,7 +80,7 @@ class Runner:
     def __init__(self, device: str) -> None:
         self.place = "cpu" if device == "emulated" else "cuda"
         empty = torch.empty(0, device=self.place)
-        self.gpu = EmulatedGpu(torch.float32, program="network") if device == "emulated" else cuda_driver.gpu(empty)
+        self.gpu = EmulatedGpu(torch.float32) if device == "emulated" else cuda_driver.gpu(empty)
 
     @torch.no_grad()
     def __call__(self, network: OccupancyNetwork, inputs: tuple, precision: str = "highest", **changed) -> torch.Tensor:

@@ -21,6 +21,7 @@ __all__ = ["Gpu", "KernelLauncher", "gpu", "try_kernels"]
 
 _SMALLEST = ("gather", "collect_roots")  # source and kernel; compiled in a tenth of a second
 _MOST_SHARED_BYTES = 97  # CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
+_MULTIPROCESSORS = 16  # CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT
 _DYNAMIC_SHARED_BYTES = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
 _ALWAYS_GRANTED_BYTES = 48 * 1024
 
@@ -32,6 +33,8 @@ class KernelLauncher(Protocol):
     """Compute capability, such as (9, 0)."""
     most_shared_bytes: int
     """Maximum shared memory of a block."""
+    multiprocessors: int
+    """Number of multiprocessors."""
 
     def threads(self, most: int) -> int:
         """Return the number of threads per block, at most `most`."""
@@ -67,9 +70,8 @@ class Gpu:
         _check(cuda_driver().cuInit(0))
         _check(cuda_driver().cuDeviceGet(byref(handle), device.index))
         _check(cuda_driver().cuDevicePrimaryCtxRetain(byref(self._context), handle))
-        most = c_int()
-        _check(cuda_driver().cuDeviceGetAttribute(byref(most), c_int(_MOST_SHARED_BYTES), handle))
-        self.most_shared_bytes = most.value
+        self.most_shared_bytes = _attribute(handle, _MOST_SHARED_BYTES)
+        self.multiprocessors = _attribute(handle, _MULTIPROCESSORS)
 
     def threads(self, most: int) -> int:
         return most
@@ -123,6 +125,12 @@ def try_kernels(device: torch.device) -> None:
 @cache
 def _gpu(index: int, dtype: torch.dtype) -> Gpu:
     return Gpu(torch.device("cuda", index), dtype)
+
+
+def _attribute(device: c_int, name: int) -> int:
+    value = c_int()
+    _check(cuda_driver().cuDeviceGetAttribute(byref(value), c_int(name), device))
+    return value.value
 
 
 def _check(code: int) -> None:

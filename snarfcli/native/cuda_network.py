@@ -214,14 +214,25 @@ def _kernels(launcher: KernelLauncher, precision: str) -> str:
 
 
 def _points_at_once(launcher: KernelLauncher, arrays: NetworkArrays, kernels: str) -> int | None:
-    """Return the number of points of a block, or None if the network is too large."""
+    """Return the number of points of a block, or None if the network is too large.
+
+    More points share the weights that a block reads, but few points would leave multiprocessors without work.
+    """
     width = len(arrays.biases[0])
-    for points, widest in _WIDEST.items():
-        if points == 128 and width <= _NARROW:
-            continue
-        if width <= widest and _shared_bytes(arrays, kernels, points) <= launcher.most_shared_bytes:
-            return points
-    return None
+    possible = [
+        points
+        for points, widest in _WIDEST.items()
+        if width <= widest
+        and (points == min(_WIDEST) or width > _NARROW)
+        and _shared_bytes(arrays, kernels, points) <= launcher.most_shared_bytes
+    ]
+
+    def in_turn(points: int) -> int:
+        """Return how many points the busiest multiprocessor evaluates, with one block at a time."""
+        blocks = -(-len(arrays.points) // points)
+        return -(-blocks // max(launcher.multiprocessors, 1)) * points
+
+    return min(possible, key=in_turn, default=None)
 
 
 def _shared_bytes(arrays: NetworkArrays, kernels: str, points: int) -> int:

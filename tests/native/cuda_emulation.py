@@ -29,6 +29,7 @@ class EmulatedGpu:
 
     capability = (9, 0)
     most_shared_bytes = 227 * 1024
+    multiprocessors = 1
 
     def __init__(self, dtype: torch.dtype, block: int = 1) -> None:
         self.dtype = dtype

@@ -227,13 +227,15 @@ def test_changed_weights_are_used_at_once(runner):
 
 
 # ---------------------------------------------------------------- limits
-def arrays_of(config: ShapeConfig) -> NetworkArrays:
+def arrays_of(config: ShapeConfig, count: int = 200_000) -> NetworkArrays:
     with torch.no_grad():
-        return NetworkArrays(*occupancy_arguments(network_of(config), *inputs_of(2)))
+        return NetworkArrays(*occupancy_arguments(network_of(config), *inputs_of(count)))
 
 
 class Chip(EmulatedGpu):
     """A launcher that only tells what it is."""
+
+    multiprocessors = 132
 
     def __init__(self, capability: tuple[int, int], kilobytes: int) -> None:
         self.capability, self.most_shared_bytes = capability, 1024 * kilobytes
@@ -257,6 +259,14 @@ def test_points_of_a_block_follow_the_network_and_the_chip():
     assert points(TURING, preset("grid"), "bfloat16") == points(HOPPER, preset("grid"), "bfloat16") == 64
     assert points(HOPPER, replace(paper, width=384), "high") == 64
     assert points(HOPPER, replace(paper, width=385), "high") is None
+
+
+def test_few_points_are_spread_over_all_multiprocessors():
+    def points(count: int) -> int | None:
+        return cuda_network._points_at_once(HOPPER, arrays_of(preset("mlp"), count), "tf32")
+
+    assert [points(count) for count in (0, 100, 132 * 64, 132 * 128)] == [128, 64, 64, 128]
+    assert points(20_000) == 64  # three times 64 in turn, not twice 128
 
 
 def test_networks_that_do_not_fit():

@@ -6,9 +6,8 @@
 //
 // Values of kRows points:
 //   float     [input][row]
-//   TF32      [inputs / 8][kRows / 16][lane][4 words], the left matrices of tensor_cores.cuh. Inner index t stands for input 2
-//   t, and
-//             t + 4 for 2 t + 1, so that a lane's sums are its own words of the next layer's left matrix.
+//   TF32      [inputs / 8][kRows / 16][lane][4 words], the left matrices of tensor_cores.cuh. Inner index t stands for input
+//             2 t, and t + 4 for 2 t + 1, so that a lane's sums are its own words of the next layer's left matrix.
 //   bfloat16  [inputs / 16][kRows / 16][lane][4 words], where that is so with the inner indices as they are.
 // Weights of all inputs of a layer, 32 numbers an input, so that those of some inputs begin at 32 times the first:
 //   float     [outputs / 32][input][32 outputs]

@@ -6,7 +6,8 @@
 //   of the right matrix, inner x 8   two words: column g of the first half, then of the second;
 //   of the sums,         16 x 8      rows g, g, g + 8, g + 8 in columns 2 t, 2 t + 1, 2 t, 2 t + 1.
 // A word is one TF32 number, inner index t of a half of four, or two bfloat16 numbers, inner indices 2 t and 2 t + 1 of a half
-// of eight. What the compiler of a CPU cannot have is in tests/native/emulation/tensor_shim.h.
+// of eight. These instructions are those of all chips since Ampere; Hopper has faster ones (wgmma), which take the weights from
+// shared memory. What a CPU's compiler cannot have is in tests/native/emulation/tensor_shim.h.
 #pragma once
 
 #include "snarf/platform.h"

@@ -62,8 +62,8 @@ class AvatarSelection:
     threads: int | None = MISSING
     """Threads for tensor work; null keeps PyTorch's choice."""
     precision: str = "high"
-    """Precision of the shape network on a GPU: highest (float32), high or medium (TF32: vertices move by hundredths of a
-    millimetre) or bfloat16 (by tenths). On a CPU the native library computes in float32."""
+    """Precision of the shape network on a GPU: highest (float32), high or medium (TF32: vertices move by at most 0.05 mm on
+    average) or bfloat16 (0.4 mm). On a CPU the native library computes in float32."""
 
 
 @dataclass

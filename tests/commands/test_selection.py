@@ -112,7 +112,7 @@ def test_what_cannot_be_used_is_rejected(skeleton, walk):
 def test_an_avatar_gets_the_precision_of_the_command():
     path = Path(__file__).parents[1] / "golden" / "avatar.pt"
     choice = replace(AVATAR, ckpt=str(path))
-    assert load_selected_avatar(choice)[0].precision == "high"  # moves no vertex by more than 0.02 mm at resolution 256
+    assert load_selected_avatar(choice)[0].precision == "high"
     assert load_selected_avatar(replace(choice, precision="bfloat16"))[0].precision == "bfloat16"
     with pytest.raises(UserError, match="precision: wanted highest, high, medium or bfloat16, got 'single'"):
         load_selected_avatar(replace(choice, precision="single"))

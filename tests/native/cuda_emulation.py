@@ -7,9 +7,11 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from snarfcli.native.cuda_compile import cuda_sources
@@ -21,12 +23,17 @@ _NUMBERS = {torch.float32: "float", torch.float64: "double"}
 
 
 class EmulatedGpu:
-    """A launcher whose blocks have up to `block` threads, each a thread of the operating system; 1 is fastest."""
+    """A launcher whose blocks have up to `block` threads; 1 is fastest.
+
+    `work` has what the blocks of each launch did, by kernel: int64 [blocks, 2, 3] with the sum over a block's threads and the
+    most of one thread, of rounds (in which the block's threads take a candidate each), halvings of a cell and Newton solves.
+    """
 
     def __init__(self, dtype: torch.dtype, block: int = 1) -> None:
         self.library = build_emulation(dtype)
         self.block = block
         self.launches: list[str] = []
+        self.work: dict[str, list[np.ndarray]] = defaultdict(list)
 
     def threads(self, most: int) -> int:
         return min(most, self.block)
@@ -36,6 +43,8 @@ class EmulatedGpu:
         assert (cuda_sources() / "cuda" / f"{source}.cu").read_text().count(f" {kernel}(") == 1
         assert min(blocks) > 0
         assert self.library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
+        counted = np.ctypeslib.as_array(self.library.work_of_blocks(), (blocks[0] * blocks[1], 2, 3))
+        self.work[kernel].append(counted.copy())
 
 
 def host_compiler() -> str | None:
@@ -48,8 +57,8 @@ def host_compiler() -> str | None:
 def build_emulation(dtype: torch.dtype) -> ctypes.CDLL:
     """Compile all kernels for one type of numbers and load them.
 
-    SNARF_EMULATION_FLAGS adds flags to the compiler. Races show with
-    LD_PRELOAD=$(g++ -print-file-name=libtsan.so) SNARF_EMULATION_FLAGS=-fsanitize=thread.
+    SNARF_EMULATION_FLAGS adds flags to the compiler. With LD_PRELOAD=$(g++ -print-file-name=libtsan.so)
+    SNARF_EMULATION_FLAGS=-fsanitize=thread the threads of a block run at the same time, and races are reported.
     """
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "kernels.so"
@@ -65,4 +74,5 @@ def build_emulation(dtype: torch.dtype) -> ctypes.CDLL:
     loaded.emulate.restype = ctypes.c_bool
     for structure in ("search", "backward", "optimizer", "optimizer_task"):
         getattr(loaded, f"{structure}_bytes").restype = ctypes.c_size_t
+    loaded.work_of_blocks.restype = ctypes.POINTER(ctypes.c_longlong)
     return loaded

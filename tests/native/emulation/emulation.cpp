@@ -17,12 +17,14 @@ struct Entry {
   void (*kernel)(Arguments);
 };
 
+std::vector<Work> last_work;  // of the last launch, by block
+
 template <class Arguments, size_t count>
 bool run_named(const Entry<Arguments> (&entries)[count], const char* name, const void* arguments, unsigned x, unsigned y,
                unsigned threads) {
   for (const auto& entry : entries)
     if (!strcmp(entry.name, name)) {
-      run_grid(entry.kernel, *static_cast<const Arguments*>(arguments), x, y, threads);
+      run_grid(entry.kernel, *static_cast<const Arguments*>(arguments), x, y, threads, last_work);
       return true;
     }
   return false;
@@ -52,6 +54,8 @@ extern "C" bool emulate(const char* name, const void* arguments, unsigned x, uns
          run_named(backward_kernels, name, arguments, x, y, threads) ||
          run_named(optimizer_kernels, name, arguments, x, y, threads);
 }
+// What the blocks of the last launch did, [blocks, 2, 3]: sum over the threads and the most of one; rounds, halvings, solves.
+extern "C" const long long* work_of_blocks() { return &last_work.data()->rounds; }
 extern "C" size_t search_bytes() { return sizeof(Search<Number>); }
 extern "C" size_t backward_bytes() { return sizeof(Backward<Number>); }
 extern "C" size_t optimizer_bytes() { return sizeof(AdamLaunch); }

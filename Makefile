@@ -70,6 +70,7 @@ format: $(INSTALLED)
 bench: export OMP_WAIT_POLICY = PASSIVE
 bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_search.py
+	$(VENV)/bin/python benchmarks/bm_balance.py
 	$(VENV)/bin/python benchmarks/bm_library.py
 	$(VENV)/bin/python benchmarks/bm_data.py
 	$(VENV)/bin/python benchmarks/bm_training.py

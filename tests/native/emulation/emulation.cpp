@@ -2,10 +2,12 @@
 #include "cuda_shim.h"
 
 #include "broyden.cu"
+#include "candidates.cu"
 #include "complete.cu"
 #include "gather.cu"
 #include "implicit.cu"
 #include "optimizer.cu"
+#include "parts.cu"
 
 namespace {
 
@@ -34,8 +36,10 @@ const Entry<const Search<Number>> search_kernels[] = {
     {"survey", survey},
     {"count_queries", count_queries},
     {"place_queries", place_queries},
-    {"search_tame", search_tame},
-    {"search_curved", search_curved},
+    {"search_cells", search_cells},
+    {"search_rest", search_rest},
+    {"halve_parts", halve_parts},
+    {"solve_parts", solve_parts},
     {"search_from_starts", search_from_starts},
     {"collect_roots", collect_roots},
     {"write_roots", write_roots},

@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.snarf-installed
 SNARF := $(VENV)/bin/snarf
 SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
-C_FAMILY = $(shell find csrc tests/native tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
+C_FAMILY = $(shell find csrc tests/native tests/pretend_gpu tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
 
 .PHONY: help setup demo test fuzz trust sanitize lint format bench clean
 

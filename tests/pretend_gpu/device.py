@@ -1,0 +1,222 @@
+"""A pretend GPU in a PyTorch without one: tensors that say cuda:0 and hold a tensor of the CPU.
+
+Importing this module puts the device in place for the whole process, before which the library of `build` must have been loaded
+(`run.run_on_pretend_gpu` does both). Every operator of PyTorch on such tensors, in the backward pass too, comes to `_dispatch`,
+which notes what a GPU would do with it and computes it on the CPU. What a GPU refuses, tensors of different devices in one
+operator, is noted while watched, and an error otherwise.
+
+Operators of ours that have a CUDA kernel run their kernel for the CPU; those without run as they would on a GPU, with their
+operators of PyTorch on the device.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from pretend_gpu import cuda_api, kernels_of_ours, pinned
+from pretend_gpu.rules import bind, changed_by, copied_to_device, kernels_of, takes_numbers, why_it_waits
+from pretend_gpu.seen import Seen, current_line
+from torch import Tensor
+from torch._ops import OpOverload
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+__all__ = ["CUDA", "PretendTensor", "watch"]
+
+CUDA = torch.device("cuda", 0)
+"""The pretend device."""
+
+_COMPOSITE = torch._C.DispatchKey.CompositeImplicitAutograd
+_watching: list[Seen] = []
+
+
+class PretendTensor(Tensor):
+    """A tensor that says it is on `CUDA`."""
+
+    inner: Tensor
+
+    @staticmethod
+    def __new__(cls, inner: Tensor, requires_grad: bool = False) -> PretendTensor:
+        layout = {"strides": inner.stride(), "storage_offset": inner.storage_offset(), "dtype": inner.dtype}
+        tensor = Tensor._make_wrapper_subclass(cls, inner.size(), **layout, device=CUDA, requires_grad=requires_grad)
+        tensor.inner = inner
+        return tensor
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        return _dispatch(func, args, kwargs or {})
+
+    def __repr__(self, **options: Any) -> str:
+        return f"{self.inner.detach()!r} on the pretend GPU"
+
+    def __format__(self, spec: str) -> str:
+        return format(self.item(), spec) if self.dim() == 0 else repr(self)
+
+    def data_ptr(self) -> int:
+        return self.inner.data_ptr()
+
+    def tolist(self) -> Any:
+        return self.detach().cpu().tolist()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> PretendTensor:
+        if id(self) not in memo:
+            copied = PretendTensor(self.inner.detach().clone(), self.requires_grad)
+            for name in vars(self).keys() - {"inner"}:
+                setattr(copied, name, getattr(self, name))  # such as that it is a parameter
+            memo[id(self)] = copied
+        return memo[id(self)]
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return self.inner.detach().__reduce_ex__(protocol)  # in a file there is no difference
+
+
+@contextmanager
+def watch(name: str = "") -> Iterator[Seen]:
+    """Note what happens on the device; at the end it becomes part of the report of `run_on_pretend_gpu`, under the name."""
+    seen = Seen(name)
+    _watching.append(seen)
+    try:
+        with torch.autograd.set_detect_anomaly(True, check_nan=False):  # keeps the lines of the forward pass
+            yield seen
+    finally:
+        _watching.remove(seen)
+        seen.append_to(os.environ.get("SNARF_PRETEND_GPU_REPORT"))
+
+
+class _OnDevice(TorchDispatchMode):
+    """Brings operators to the device that make tensors out of nothing, or out of tensors of the CPU."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None) -> Any:
+        return _dispatch(func, args, kwargs or {})
+
+
+# ---------------------------------------------------------------- operators
+def _dispatch(operator: OpOverload, arguments: Sequence[Any], named: dict[str, Any]) -> Any:
+    """Compute an operator on the CPU, and note what a GPU would have done."""
+    _begin_in_thread()  # in a thread of autograd too
+    leaves = tree_leaves((arguments, named))
+    mine = [leaf for leaf in leaves if isinstance(leaf, PretendTensor)]
+    host = [leaf for leaf in leaves if isinstance(leaf, Tensor) and not isinstance(leaf, PretendTensor)]
+    to = None if named.get("device") is None else torch.device(named["device"]).type
+    if pinned.concerns(operator, named):
+        return pinned.run(operator, arguments, named)
+    if not mine and to != "cuda":
+        return operator(*arguments, **named)
+    if operator.has_kernel_for_dispatch_key(_COMPOSITE):
+        with _OnDevice():
+            return operator.decompose(*arguments, **named)
+    if operator.namespace == "snarf" and not kernels_of_ours.has_cuda_kernel(operator):
+        with _OnDevice():
+            return kernels_of_ours.default_kernel(operator)(*arguments, **named)
+    values = bind(operator, arguments, named)
+    if operator._opname in ("_to_copy", "copy_"):
+        _note_transfer(values, to)
+    else:
+        _note_devices(operator, values, mine, host)
+        if mine and (reason := why_it_waits(operator, values)):
+            _note("waits", f"{reason} {_sizes(mine[:1])}")
+    result = operator(*tree_map(_on_host, arguments), **tree_map(_on_host, named))
+    stays = to != "cpu" and not (operator._opname == "copy_" and not isinstance(arguments[0], PretendTensor))
+    return _on_device(operator, values, result, mine, host) if stays else result
+
+
+def _on_host(leaf: Any) -> Any:
+    """Return the tensor that a tensor of the device holds; the CPU instead of the device; anything else as it is."""
+    if isinstance(leaf, PretendTensor):
+        return leaf.inner
+    return torch.device("cpu") if isinstance(leaf, torch.device) and leaf.type == "cuda" else leaf
+
+
+def _on_device(operator: OpOverload, values: dict[str, Any], result: Any, mine: list[PretendTensor], host: list[Tensor]) -> Any:
+    """Return the result of an operator as tensors of the device; arguments that it returns stay themselves."""
+    if any(tensor.inner.shape != tensor.shape or tensor.inner.stride() != tensor.stride() for tensor in mine):
+        raise NotImplementedError(f"{operator} changes the shape of a tensor in place, which the pretend GPU cannot do")
+    results = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
+    if _watching and (count := kernels_of(operator, values, results)):
+        line = f"{operator.namespace}::{operator._opname}: {current_line()}"
+        for seen in _watching:
+            seen.launches[line] += count
+    given: dict[int, Tensor] = {id(tensor.inner): tensor for tensor in mine} | {id(tensor): tensor for tensor in host}
+
+    def placed(leaf: Any) -> Any:
+        if not isinstance(leaf, Tensor):
+            return leaf
+        return given[id(leaf)] if id(leaf) in given else PretendTensor(leaf)
+
+    return tree_map(placed, result)
+
+
+# ---------------------------------------------------------------- what is noted
+def _note(kind: str, what: str) -> None:
+    line = f"{what}: {current_line()}" if _watching or kind == "mixing" else ""
+    if kind == "mixing" and not _watching:
+        raise RuntimeError(f"Expected all tensors to be on the same device: {line}")
+    for seen in _watching:
+        getattr(seen, kind).append(line)
+
+
+def _note_devices(operator: OpOverload, values: dict[str, Any], mine: list[PretendTensor], host: list[Tensor]) -> None:
+    """Note tensors of both devices in one operator, where a GPU refuses them, and those that the operator copies itself."""
+    copied, changed = copied_to_device(operator, values) if mine else [], changed_by(operator, values)
+    for tensor in copied:
+        _note("copies", f"{_sizes([tensor])} of the CPU in {operator._opname} of a tensor of the GPU")
+    are_numbers = takes_numbers(operator)
+    refused = [tensor for tensor in host if tensor.dim() or not are_numbers or any(tensor is one for one in changed)]
+    refused = [tensor for tensor in refused if not any(tensor is one for one in copied)]
+    if mine and refused:
+        _note("mixing", f"{operator} of tensors {_sizes(mine)} of the GPU and {_sizes(refused)} of the CPU")
+    generator = values.get("generator")
+    if generator is not None and generator.device.type == "cpu":
+        _note("mixing", f"{operator} for the GPU with a generator of the CPU")
+
+
+def _note_transfer(values: dict[str, Any], to: str | None) -> None:
+    """Note a copy between host and device, unless it is from or to pinned memory and the host goes on at once."""
+    into, source = (values["self"], values["src"]) if "src" in values else (None, values["self"])
+    from_device = isinstance(source, PretendTensor)
+    to_device = isinstance(into, PretendTensor) if into is not None else (to or source.device.type) == "cuda"
+    if from_device == to_device or not source.numel():
+        return
+    goes_on = values["non_blocking"]
+    if from_device:
+        if not goes_on or (into is not None and not pinned.is_pinned(into)):
+            _note("waits", f"copy {_sizes([source])} to the CPU")
+    elif not pinned.is_pinned(source):
+        _note("copies", f"copy {_sizes([source])} to the GPU")
+    elif not goes_on:
+        _note("waits", f"copy {_sizes([source])} from pinned memory without non_blocking")
+
+
+def _sizes(tensors: Sequence[Tensor]) -> str:
+    return ", ".join(f"{str(tensor.dtype).removeprefix('torch.')}{list(tensor.shape)}" for tensor in tensors)
+
+
+# ---------------------------------------------------------------- in place of a GPU
+def _begin_in_thread() -> None:
+    """Let torch.tensor(..., device=CUDA) make a tensor of the CPU and then copy it, in the thread that calls this."""
+    torch._C._set_only_lift_cpu_tensors(True)
+
+
+def _install() -> None:
+    """Bring all operators of this process to `_dispatch`, in all its threads, and pretend that PyTorch sees a GPU."""
+    torch.__future__.set_overwrite_module_params_on_conversion(True)  # an ordinary parameter cannot become a PretendTensor
+    cuda_api.install(lambda what: _note("waits", what))
+    kernels_of_ours.install()
+    _OnDevice().__enter__()
+    _begin_in_thread()
+    run = threading.Thread.run
+
+    def run_on_device(self: threading.Thread) -> None:
+        _begin_in_thread()
+        with _OnDevice():
+            run(self)
+
+    threading.Thread.run = run_on_device
+
+
+_install()

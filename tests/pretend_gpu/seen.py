@@ -1,0 +1,94 @@
+"""What happened on the pretend device while it was watched, and the lines of the code that made it happen."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import sysconfig
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+import snarfcli
+
+__all__ = ["Seen", "current_line"]
+
+_PACKAGE = str(Path(snarfcli.__file__).parent) + "/"
+_NOT_A_CALLER = (
+    *(str(Path(file).parent) + "/" for file in (torch.__file__, sysconfig.__file__, __file__)),  # the last: this folder
+    "<frozen",
+)
+_ENTRY = re.compile(r'\s*File "([^"]+)", line (\d+), in (\S+)')  # of traceback.format_stack
+_MOST_LINES = 3
+
+
+@dataclass
+class Seen:
+    """Events of one `watch`. Each text is "what: file:line function < its callers"; lines of snarfcli if there are any."""
+
+    name: str = ""
+    """Of the watch."""
+    mixing: list[str] = field(default_factory=list)
+    """Operators that got tensors of different devices and would fail on a GPU."""
+    waits: list[str] = field(default_factory=list)
+    """Operators for which the host would wait until the GPU has done everything before."""
+    copies: list[str] = field(default_factory=list)
+    """Copies from pageable host memory to the GPU."""
+    launches: Counter[str] = field(default_factory=Counter)
+    """Estimated number of kernels, by operator and line."""
+
+    @property
+    def kernels(self) -> int:
+        """Estimated number of kernel launches."""
+        return sum(self.launches.values())
+
+    def append_to(self, file: str | None) -> None:
+        """Write the events to the end of a file, as one line that `read_all` reads."""
+        if file:
+            with open(file, "a") as lines:
+                print(json.dumps(vars(self)), file=lines)
+
+    @classmethod
+    def read_all(cls, file: Path) -> list[Seen]:
+        """Return all that `append_to` has written."""
+        found = [cls(**json.loads(line)) for line in file.read_text().splitlines()]
+        return [replace(seen, launches=Counter(seen.launches)) for seen in found]
+
+    def lines(self) -> Iterator[str]:
+        """Yield a summary, and every event with its number."""
+        counts = f"{len(self.mixing)} mixing, {len(self.waits)} waits, {len(self.copies)} copies, ~{self.kernels} kernels"
+        yield f"{self.name or 'watched'}: {counts}"
+        for kind in ("mixing", "waits", "copies"):
+            yield from (f"  {kind} x{count} {what}" for what, count in Counter(getattr(self, kind)).most_common())
+
+
+def current_line() -> str:
+    """Return the innermost lines of snarfcli that are being executed; without any, of the program that uses it.
+
+    In the backward pass of an operator that Python does not call, they are those that called it in the forward pass.
+    """
+    frame, stack = sys._getframe(1), []
+    while frame is not None:
+        stack.append((frame.f_code.co_filename, frame.f_lineno, frame.f_code.co_name))
+        frame = frame.f_back
+    node = None if _lines_of(stack) else torch._C._current_autograd_node()
+    if node is None:
+        return " < ".join(_lines_of(stack)) or "unknown"
+    texts = (getattr(node, "metadata", None) or {}).get("traceback_", [])  # kept by PyTorch's detection of anomalies
+    entries = [(match[1], match[2], match[3]) for text in reversed(texts) if (match := _ENTRY.match(text))]
+    return f"backward of {node.name()} < {' < '.join(_lines_of(entries)) or 'unknown'}"
+
+
+def _lines_of(stack: Iterable[tuple[str, int | str, str]]) -> list[str]:
+    """Return the innermost lines of the package on a stack of (file, line, function), or the one that called PyTorch."""
+    callers, lines = [], []
+    for file, number, function in stack:
+        if file.startswith(_PACKAGE):
+            lines.append(f"snarfcli/{file.removeprefix(_PACKAGE)}:{number} {function}")
+        elif not file.startswith(_NOT_A_CALLER):
+            callers.append(f"{Path(file).name}:{number} {function}")
+    return lines[:_MOST_LINES] or callers[:1]

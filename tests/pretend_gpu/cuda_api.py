@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
+from pretend_gpu.graphs import PretendCapture, PretendGraph, is_capturing
 
 __all__ = ["install"]
 
@@ -66,11 +67,15 @@ def install(note_wait: Callable[[str], None]) -> None:
         "_lazy_init": None, "is_available": True, "is_initialized": True, "device_count": 1, "current_device": 0,
         "get_device_name": _PROPERTIES.name, "get_device_capability": _CAPABILITY, "get_device_properties": _PROPERTIES,
         "is_bf16_supported": True, "empty_cache": None, "memory_allocated": 0, "max_memory_allocated": 0,
-        "reset_peak_memory_stats": None, "mem_get_info": (_BYTES, _BYTES), "is_current_stream_capturing": False,
+        "reset_peak_memory_stats": None, "mem_get_info": (_BYTES, _BYTES), "graph_pool_handle": (0, 1),
     }  # fmt: skip
     for name, answer in answers.items():
         setattr(torch.cuda, name, _answers(answer))
-    for name, value in {"synchronize": synchronize, "Event": Event, "Stream": Stream}.items():
+    replaced = {
+        "synchronize": synchronize, "Event": Event, "Stream": Stream, "CUDAGraph": PretendGraph,
+        "graph": PretendCapture, "is_current_stream_capturing": is_capturing,
+    }  # fmt: skip
+    for name, value in replaced.items():
         setattr(torch.cuda, name, value)
     for name in ("current_stream", "default_stream"):
         setattr(torch.cuda, name, lambda *_: Stream())

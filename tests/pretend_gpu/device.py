@@ -15,12 +15,13 @@ import os
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
-from pretend_gpu import cuda_api, kernels_of_ours, pinned
+from pretend_gpu import cuda_api, graphs, kernels_of_ours, pinned
 from pretend_gpu.rules import bind, changed_by, copied_to_device, kernels_of, takes_numbers, why_it_waits
-from pretend_gpu.seen import Seen, current_line
+from pretend_gpu.seen import Seen, current_line, is_watched, note, note_kernels, watching
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -32,7 +33,6 @@ CUDA = torch.device("cuda", 0)
 """The pretend device."""
 
 _COMPOSITE = torch._C.DispatchKey.CompositeImplicitAutograd
-_watching: list[Seen] = []
 
 
 class PretendTensor(Tensor):
@@ -78,14 +78,12 @@ class PretendTensor(Tensor):
 @contextmanager
 def watch(name: str = "") -> Iterator[Seen]:
     """Note what happens on the device; at the end it becomes part of the report of `run_on_pretend_gpu`, under the name."""
-    seen = Seen(name)
-    _watching.append(seen)
-    try:
-        with torch.autograd.set_detect_anomaly(True, check_nan=False):  # keeps the lines of the forward pass
-            yield seen
-    finally:
-        _watching.remove(seen)
-        seen.append_to(os.environ.get("SNARF_PRETEND_GPU_REPORT"))
+    with watching(name) as seen:
+        try:
+            with torch.autograd.set_detect_anomaly(True, check_nan=False):  # keeps the lines of the forward pass
+                yield seen
+        finally:
+            seen.append_to(os.environ.get("SNARF_PRETEND_GPU_REPORT"))
 
 
 class _OnDevice(TorchDispatchMode):
@@ -120,9 +118,17 @@ def _dispatch(operator: OpOverload, arguments: Sequence[Any], named: dict[str, A
         _note_devices(operator, values, mine, host)
         if mine and (reason := why_it_waits(operator, values)):
             _note("waits", f"{reason} {_sizes(mine[:1])}")
-    result = operator(*tree_map(_on_host, arguments), **tree_map(_on_host, named))
-    stays = to != "cpu" and not (operator._opname == "copy_" and not isinstance(arguments[0], PretendTensor))
-    return _on_device(operator, values, result, mine, host) if stays else result
+    arguments, named = tree_map(_on_host, (arguments, named))
+    result = operator(*arguments, **named)
+    if any(tensor.inner.shape != tensor.shape or tensor.inner.stride() != tensor.stride() for tensor in mine):
+        raise NotImplementedError(f"{operator} changes the shape of a tensor in place, which the pretend GPU cannot do")
+    if is_watched() or graphs.is_capturing():
+        line = f"{operator.namespace}::{operator._opname}: {current_line()}"
+        launches = kernels_of(operator, values, [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)])
+        note_kernels(line, launches)
+        graphs.record(partial(operator, *arguments, **named), (arguments, named), result, launches, line)
+    stays = to != "cpu" and not (operator._opname == "copy_" and not isinstance(values["self"], PretendTensor))
+    return _on_device(result, mine, host) if stays else result
 
 
 def _on_host(leaf: Any) -> Any:
@@ -132,15 +138,8 @@ def _on_host(leaf: Any) -> Any:
     return torch.device("cpu") if isinstance(leaf, torch.device) and leaf.type == "cuda" else leaf
 
 
-def _on_device(operator: OpOverload, values: dict[str, Any], result: Any, mine: list[PretendTensor], host: list[Tensor]) -> Any:
+def _on_device(result: Any, mine: list[PretendTensor], host: list[Tensor]) -> Any:
     """Return the result of an operator as tensors of the device; arguments that it returns stay themselves."""
-    if any(tensor.inner.shape != tensor.shape or tensor.inner.stride() != tensor.stride() for tensor in mine):
-        raise NotImplementedError(f"{operator} changes the shape of a tensor in place, which the pretend GPU cannot do")
-    results = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
-    if _watching and (count := kernels_of(operator, values, results)):
-        line = f"{operator.namespace}::{operator._opname}: {current_line()}"
-        for seen in _watching:
-            seen.launches[line] += count
     given: dict[int, Tensor] = {id(tensor.inner): tensor for tensor in mine} | {id(tensor): tensor for tensor in host}
 
     def placed(leaf: Any) -> Any:
@@ -153,11 +152,15 @@ def _on_device(operator: OpOverload, values: dict[str, Any], result: Any, mine: 
 
 # ---------------------------------------------------------------- what is noted
 def _note(kind: str, what: str) -> None:
-    line = f"{what}: {current_line()}" if _watching or kind == "mixing" else ""
-    if kind == "mixing" and not _watching:
+    """Note an event with the line that made it, or raise what a GPU raises, unless that is watched."""
+    if not is_watched() and not graphs.is_capturing() and kind != "mixing":
+        return
+    line = f"{what}: {current_line()}"
+    note(kind, line)
+    if kind == "mixing" and not is_watched():
         raise RuntimeError(f"Expected all tensors to be on the same device: {line}")
-    for seen in _watching:
-        getattr(seen, kind).append(line)
+    if kind != "mixing" and graphs.is_capturing():
+        raise RuntimeError(f"CUDA error: operation not permitted when stream is capturing: {line}")
 
 
 def _note_devices(operator: OpOverload, values: dict[str, Any], mine: list[PretendTensor], host: list[Tensor]) -> None:

@@ -8,6 +8,7 @@ import sys
 import sysconfig
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import torch
 
 import snarfcli
 
-__all__ = ["Seen", "current_line"]
+__all__ = ["Seen", "current_line", "is_watched", "note", "note_kernels", "watching"]
 
 _PACKAGE = str(Path(snarfcli.__file__).parent) + "/"
 _NOT_A_CALLER = (
@@ -64,6 +65,38 @@ class Seen:
         yield f"{self.name or 'watched'}: {counts}"
         for kind in ("mixing", "waits", "copies"):
             yield from (f"  {kind} x{count} {what}" for what, count in Counter(getattr(self, kind)).most_common())
+
+
+_seen: list[Seen] = []
+
+
+@contextmanager
+def watching(name: str) -> Iterator[Seen]:
+    """Note what happens on the device, in all threads."""
+    seen = Seen(name)
+    _seen.append(seen)
+    try:
+        yield seen
+    finally:
+        _seen[:] = [one for one in _seen if one is not seen]
+
+
+def is_watched() -> bool:
+    """Return whether what happens is noted."""
+    return bool(_seen)
+
+
+def note(kind: str, what: str) -> None:
+    """Note a text of "mixing", "waits" or "copies"."""
+    for seen in _seen:
+        getattr(seen, kind).append(what)
+
+
+def note_kernels(line: str, count: int) -> None:
+    """Note the number of kernels that a line has started."""
+    for seen in _seen:
+        if count:
+            seen.launches[line] += count
 
 
 def current_line() -> str:

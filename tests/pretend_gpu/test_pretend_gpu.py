@@ -228,3 +228,50 @@ def test_the_device_computes_what_the_cpu_does():
         print("equal")
     """
     assert run_on_pretend_gpu(code).output == "equal\n"
+
+
+def test_a_replay_of_a_graph_computes_from_the_present_values():
+    code = """
+        import torch
+        from pretend_gpu.device import CUDA, watch
+
+        x, total, step = (torch.zeros(size, device=CUDA) for size in (3, 3, 1))
+        w = torch.ones(3, device=CUDA, requires_grad=True)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            step.add_(1)
+            y = (x * w).square().view(3, 1).sum(1)  # a view and its result
+            (gradient,) = torch.autograd.grad(y.sum(), w)
+            total[1:] += y[1:]
+        assert (step.item(), total.tolist()) == (0, [0, 0, 0])
+        assert y.isnan().all()
+        for first in (1.0, 2.0):
+            x.copy_(torch.tensor([first, 2, 3]))
+            with watch(f"replay {first:.0f}"):
+                graph.replay()
+            assert y.tolist() == [first**2, 4, 9]
+            assert gradient.tolist() == [2 * first**2, 8, 18]
+        assert (step.item(), total.tolist()) == (2, [0, 8, 18])
+    """
+    report = run_on_pretend_gpu(code)
+    for seen in report.seen:
+        assert (seen.mixing, seen.waits, seen.copies) == ([], [], [])
+        assert seen.kernels > 5
+
+
+def test_waits_and_copies_are_errors_in_a_capture():
+    code = """
+        import torch
+        from pretend_gpu.device import CUDA
+
+        x = torch.ones(2, device=CUDA)
+        for what in (lambda: x.sum().item(), lambda: torch.tensor([1.0], device=CUDA), torch.cuda.synchronize):
+            try:
+                with torch.cuda.graph(torch.cuda.CUDAGraph()):
+                    what()
+            except RuntimeError as error:
+                print(error)
+    """
+    lines = run_on_pretend_gpu(code).output.splitlines()
+    assert len(lines) == 3
+    assert all("operation not permitted when stream is capturing" in line and ": program.py:" in line for line in lines)

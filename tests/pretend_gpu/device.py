@@ -5,8 +5,7 @@ Importing this module puts the device in place for the whole process, before whi
 which notes what a GPU would do with it and computes it on the CPU. What a GPU refuses, tensors of different devices in one
 operator, is noted while watched, and an error otherwise.
 
-Operators of ours that have a CUDA kernel run their kernel for the CPU; those without run as they would on a GPU, with their
-operators of PyTorch on the device.
+Operators of ours without a CUDA kernel run as they would on a GPU, as operators of PyTorch; for others see `kernels_of_ours`.
 """
 
 from __future__ import annotations
@@ -108,9 +107,9 @@ def _dispatch(operator: OpOverload, arguments: Sequence[Any], named: dict[str, A
     if operator.has_kernel_for_dispatch_key(_COMPOSITE):
         with _OnDevice():
             return operator.decompose(*arguments, **named)
-    if operator.namespace == "snarf" and not kernels_of_ours.has_cuda_kernel(operator):
+    if operator.namespace == "snarf" and (kernel := kernels_of_ours.kernel_on_device(operator)) is not None:
         with _OnDevice():
-            return kernels_of_ours.default_kernel(operator)(*arguments, **named)
+            return kernel(*arguments, **named)
     values = bind(operator, arguments, named)
     if operator._opname in ("_to_copy", "copy_"):
         _note_transfer(values, to)

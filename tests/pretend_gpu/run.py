@@ -34,10 +34,12 @@ class Report:
         return found
 
 
-def run_on_pretend_gpu(code: str, *arguments: str | Path, timeout_s: float = 300) -> Report:
+def run_on_pretend_gpu(code: str, *arguments: str | Path, emulated: bool = False, timeout_s: float = 300) -> Report:
     """Run Python code, which may be indented, in a process of its own with a pretend GPU; skip the test where there is none.
 
     The code uses the device as `from pretend_gpu.device import CUDA, watch` and finds `arguments` in `sys.argv[1:]`.
+    With `emulated`, operators of ours run their CUDA kernels, compiled as C++, instead of those for the CPU: slower, with the
+    true numbers of kernels and waits.
 
     Raises:
         AssertionError: the code failed; the message has its output.
@@ -51,6 +53,7 @@ def run_on_pretend_gpu(code: str, *arguments: str | Path, timeout_s: float = 300
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join([str(_START.parents[1]), *filter(None, sys.path)]),
             "SNARF_PRETEND_GPU_REPORT": str(report),
+            "SNARF_PRETEND_GPU_EMULATED": str(int(emulated)),
         }
         command = [sys.executable, str(_START), str(build_library()), str(program), *map(str, arguments)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout_s)

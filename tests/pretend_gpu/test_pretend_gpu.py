@@ -275,3 +275,45 @@ def test_waits_and_copies_are_errors_in_a_capture():
     lines = run_on_pretend_gpu(code).output.splitlines()
     assert len(lines) == 3
     assert all("operation not permitted when stream is capturing" in line and ": program.py:" in line for line in lines)
+
+
+def test_emulated_kernels_find_what_those_for_the_cpu_find_and_can_be_captured():
+    code = """
+        import torch
+        from pretend_gpu.device import CUDA, watch
+        from snarfcli.deformer.implicit import add_implicit_gradient, implicit_backward
+        from snarfcli.deformer.ops import complete_search
+
+        torch.manual_seed(0)
+        points, box = torch.rand(2, 20, 3) - 0.5, [-torch.ones(3), torch.ones(3)]
+        transforms = torch.eye(3, 4).reshape(12) + 0.05 * torch.rand(2, 27, 12)
+        settings = [3, 3, 3], None, 1e-5, 10, True
+        wanted = complete_search(points, transforms, *box, *settings, None, "auto")
+        given = [tensor.to(CUDA) for tensor in (points, transforms, *box)]
+        with watch("without a capacity"):
+            complete_search(*given, *settings, None, "auto")
+        with watch("with a capacity"):
+            found = complete_search(*given, *settings, 64, "auto")
+        roots = found[3].item()
+        assert roots == len(wanted[0])
+        for one, other in zip(found[:3], wanted[:3], strict=True):
+            assert torch.allclose(one[:roots].cpu(), other, atol=1e-5)
+
+        rest = (*given[2:], [3, 3, 3], 2, 20)
+        gradient, total = torch.rand(64, 3, device=CUDA), torch.zeros(2, 27, 12, device=CUDA)
+        of_points, of_transforms = implicit_backward(gradient, *found[:3], *rest, True, True, "auto")
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            added = add_implicit_gradient(total, gradient, *found[:3], *rest, True, "auto")  # without an operator
+        with watch("replay"):
+            graph.replay()
+            graph.replay()
+        assert torch.allclose(added.cpu(), of_points.cpu()) and torch.allclose(total.cpu(), 2 * of_transforms.cpu())
+    """
+    report = run_on_pretend_gpu(code, emulated=True)
+    (wait,) = report["without a capacity"].waits
+    assert wait.startswith("copy int32[2] to the CPU: snarfcli/native/cuda_launches.py:")
+    for name in ("with a capacity", "replay"):
+        assert (report[name].mixing, report[name].waits, report[name].copies) == ([], [], [])
+    assert any(line.startswith("search_tame: snarfcli/") for line in report["with a capacity"].launches)
+    assert [count for line, count in report["replay"].launches.items() if line.startswith("implicit_backward: ")] == [2]

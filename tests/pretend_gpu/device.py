@@ -12,26 +12,23 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, ValuesView
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import torch
 from pretend_gpu import cuda_api, graphs, kernels_of_ours, pinned
-from pretend_gpu.rules import bind, changed_by, copied_to_device, kernels_of, takes_numbers, why_it_waits
+from pretend_gpu.rules import bind, changed_by, copied_to_device, is_composite, kernels_of, takes_numbers, why_it_waits
 from pretend_gpu.seen import Seen, current_line, is_watched, note, note_kernels, watching
 from torch import Tensor
 from torch._ops import OpOverload
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 __all__ = ["CUDA", "PretendTensor", "watch"]
 
 CUDA = torch.device("cuda", 0)
 """The pretend device."""
-
-_COMPOSITE = torch._C.DispatchKey.CompositeImplicitAutograd
 
 
 class PretendTensor(Tensor):
@@ -96,15 +93,15 @@ class _OnDevice(TorchDispatchMode):
 def _dispatch(operator: OpOverload, arguments: Sequence[Any], named: dict[str, Any]) -> Any:
     """Compute an operator on the CPU, and note what a GPU would have done."""
     _begin_in_thread()  # in a thread of autograd too
-    leaves = tree_leaves((arguments, named))
-    mine = [leaf for leaf in leaves if isinstance(leaf, PretendTensor)]
-    host = [leaf for leaf in leaves if isinstance(leaf, Tensor) and not isinstance(leaf, PretendTensor)]
+    tensors = list(_tensors((arguments, named.values())))
+    mine = [tensor for tensor in tensors if isinstance(tensor, PretendTensor)]
+    host = [tensor for tensor in tensors if not isinstance(tensor, PretendTensor)]
     to = None if named.get("device") is None else torch.device(named["device"]).type
     if pinned.concerns(operator, named):
         return pinned.run(operator, arguments, named)
     if not mine and to != "cuda":
         return operator(*arguments, **named)
-    if operator.has_kernel_for_dispatch_key(_COMPOSITE):
+    if is_composite(operator):
         with _OnDevice():
             return operator.decompose(*arguments, **named)
     if operator.namespace == "snarf" and (kernel := kernels_of_ours.kernel_on_device(operator)) is not None:
@@ -117,17 +114,31 @@ def _dispatch(operator: OpOverload, arguments: Sequence[Any], named: dict[str, A
         _note_devices(operator, values, mine, host)
         if mine and (reason := why_it_waits(operator, values)):
             _note("waits", f"{reason} {_sizes(mine[:1])}")
-    arguments, named = tree_map(_on_host, (arguments, named))
+    arguments, named = _mapped(_on_host, arguments), {name: _mapped(_on_host, value) for name, value in named.items()}
     result = operator(*arguments, **named)
     if any(tensor.inner.shape != tensor.shape or tensor.inner.stride() != tensor.stride() for tensor in mine):
         raise NotImplementedError(f"{operator} changes the shape of a tensor in place, which the pretend GPU cannot do")
     if is_watched() or graphs.is_capturing():
         line = f"{operator.namespace}::{operator._opname}: {current_line()}"
-        launches = kernels_of(operator, values, [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)])
+        launches = kernels_of(operator, values, list(_tensors(result)))
         note_kernels(line, launches)
         graphs.record(partial(operator, *arguments, **named), (arguments, named), result, launches, line)
     stays = to != "cpu" and not (operator._opname == "copy_" and not isinstance(values["self"], PretendTensor))
     return _on_device(result, mine, host) if stays else result
+
+
+def _mapped(function: Callable[[Any], Any], value: Any) -> Any:
+    """Return an argument or a result with `function` applied to what its lists and tuples hold."""
+    return type(value)(_mapped(function, one) for one in value) if isinstance(value, list | tuple) else function(value)
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    """Yield the tensors of an argument or a result."""
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, list | tuple | ValuesView):
+        for one in value:
+            yield from _tensors(one)
 
 
 def _on_host(leaf: Any) -> Any:
@@ -146,7 +157,7 @@ def _on_device(result: Any, mine: list[PretendTensor], host: list[Tensor]) -> An
             return leaf
         return given[id(leaf)] if id(leaf) in given else PretendTensor(leaf)
 
-    return tree_map(placed, result)
+    return _mapped(placed, result)
 
 
 # ---------------------------------------------------------------- what is noted

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch._ops import OpOverload
 
-__all__ = ["bind", "changed_by", "copied_to_device", "kernels_of", "takes_numbers", "why_it_waits"]
+__all__ = ["bind", "changed_by", "copied_to_device", "is_composite", "kernels_of", "takes_numbers", "why_it_waits"]
 
 _PUTS = ("index_put", "index_put_", "_index_put_impl_", "_unsafe_index_put")
 _INDEXED = ("index", "_unsafe_index", *_PUTS)
@@ -46,9 +46,14 @@ _TENSORS_PER_KERNEL = 60  # of the operators that take lists
 
 def bind(operator: OpOverload, arguments: Sequence[Any], named: dict[str, Any]) -> dict[str, Any]:
     """Return all arguments of a call by their names in the schema, with the defaults of those that are missing."""
+    names, defaults = _signature(operator)
+    return defaults | dict(zip(names, arguments, strict=False)) | named
+
+
+@cache
+def _signature(operator: OpOverload) -> tuple[list[str], dict[str, Any]]:
     schema = operator._schema.arguments
-    defaults = {one.name: one.default_value for one in schema if one.has_default_value()}
-    return defaults | {one.name: value for one, value in zip(schema, arguments, strict=False)} | named
+    return [one.name for one in schema], {one.name: one.default_value for one in schema if one.has_default_value()}
 
 
 def kernels_of(operator: OpOverload, values: dict[str, Any], results: Sequence[Tensor]) -> int:
@@ -89,7 +94,18 @@ def copied_to_device(operator: OpOverload, values: dict[str, Any]) -> list[Tenso
 
 def changed_by(operator: OpOverload, values: dict[str, Any]) -> list[Any]:
     """Return the arguments that an operator changes in place."""
-    return [values[one.name] for one in operator._schema.arguments if one.alias_info is not None and one.alias_info.is_write]
+    return [values[name] for name in _changed_names(operator)]
+
+
+@cache
+def _changed_names(operator: OpOverload) -> list[str]:
+    return [one.name for one in operator._schema.arguments if one.alias_info is not None and one.alias_info.is_write]
+
+
+@cache
+def is_composite(operator: OpOverload) -> bool:
+    """Return whether an operator is computed by others, in the forward and in the backward pass."""
+    return operator.has_kernel_for_dispatch_key(torch._C.DispatchKey.CompositeImplicitAutograd)
 
 
 @cache

@@ -7,10 +7,12 @@ import re
 import sys
 import sysconfig
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -104,24 +106,31 @@ def current_line() -> str:
 
     In the backward pass of an operator that Python does not call, they are those that called it in the forward pass.
     """
-    frame, stack = sys._getframe(1), []
-    while frame is not None:
-        stack.append((frame.f_code.co_filename, frame.f_lineno, frame.f_code.co_name))
+    frame, lines, caller = sys._getframe(1), [], None
+    while frame is not None and len(lines) < _MOST_LINES:
+        is_of_package, file = _place(frame.f_code.co_filename)
+        if file and (is_of_package or caller is None):
+            line = f"{file}:{frame.f_lineno} {frame.f_code.co_name}"
+            lines, caller = ([*lines, line], caller) if is_of_package else (lines, line)
         frame = frame.f_back
-    node = None if _lines_of(stack) else torch._C._current_autograd_node()
-    if node is None:
-        return " < ".join(_lines_of(stack)) or "unknown"
-    texts = (getattr(node, "metadata", None) or {}).get("traceback_", [])  # kept by PyTorch's detection of anomalies
-    entries = [(match[1], match[2], match[3]) for text in reversed(texts) if (match := _ENTRY.match(text))]
-    return f"backward of {node.name()} < {' < '.join(_lines_of(entries)) or 'unknown'}"
+    node = None if lines or caller else torch._C._current_autograd_node()
+    return " < ".join(lines) or caller or ("unknown" if node is None else _line_of_node(node))
 
 
-def _lines_of(stack: Iterable[tuple[str, int | str, str]]) -> list[str]:
-    """Return the innermost lines of the package on a stack of (file, line, function), or the one that called PyTorch."""
-    callers, lines = [], []
-    for file, number, function in stack:
-        if file.startswith(_PACKAGE):
-            lines.append(f"snarfcli/{file.removeprefix(_PACKAGE)}:{number} {function}")
-        elif not file.startswith(_NOT_A_CALLER):
-            callers.append(f"{Path(file).name}:{number} {function}")
-    return lines[:_MOST_LINES] or callers[:1]
+def _line_of_node(node: Any) -> str:
+    """Return the name of a node of the backward pass, and the lines that made it, where PyTorch kept them (see `watch`)."""
+    lines, callers = [], []
+    for text in reversed((getattr(node, "metadata", None) or {}).get("traceback_", [])):
+        match = _ENTRY.match(text)
+        is_of_package, file = _place(match[1]) if match else (False, None)
+        if match and file:
+            (lines if is_of_package else callers).append(f"{file}:{match[2]} {match[3]}")
+    return f"backward of {node.name()} < {' < '.join(lines[:_MOST_LINES] or callers[:1]) or 'unknown'}"
+
+
+@cache
+def _place(file: str) -> tuple[bool, str | None]:
+    """Return whether a file is of the package, and its name in a report: None for files of PyTorch, Python and this folder."""
+    if file.startswith(_PACKAGE):
+        return True, f"snarfcli/{file.removeprefix(_PACKAGE)}"
+    return False, None if file.startswith(_NOT_A_CALLER) else Path(file).name

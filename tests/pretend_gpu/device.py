@@ -96,7 +96,8 @@ def _dispatch(operator: OpOverload, arguments: Sequence[Any], named: dict[str, A
     tensors = list(_tensors((arguments, named.values())))
     mine = [tensor for tensor in tensors if isinstance(tensor, PretendTensor)]
     host = [tensor for tensor in tensors if not isinstance(tensor, PretendTensor)]
-    to = None if named.get("device") is None else torch.device(named["device"]).type
+    values = bind(operator, arguments, named)
+    to = None if values.get("device") is None else torch.device(values["device"]).type
     if pinned.concerns(operator, named):
         return pinned.run(operator, arguments, named)
     if not mine and to != "cuda":
@@ -104,10 +105,9 @@ def _dispatch(operator: OpOverload, arguments: Sequence[Any], named: dict[str, A
     if is_composite(operator):
         with _OnDevice():
             return operator.decompose(*arguments, **named)
-    if operator.namespace == "snarf" and (kernel := kernels_of_ours.kernel_on_device(operator)) is not None:
+    if operator.namespace == "snarf" and (kernel := kernels_of_ours.kernel_on_device(operator, values)) is not None:
         with _OnDevice():
             return kernel(*arguments, **named)
-    values = bind(operator, arguments, named)
     if operator._opname in ("_to_copy", "copy_"):
         _note_transfer(values, to)
     else:

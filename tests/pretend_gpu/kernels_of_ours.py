@@ -47,12 +47,15 @@ class _Launcher:
         graphs.record(run, (), (), 1, line)
 
 
-def kernel_on_device(operator: OpOverload) -> Callable[..., Any] | None:
-    """Return the function that computes an operator of ours from tensors of the device; None to run its kernel for the CPU."""
+def kernel_on_device(operator: OpOverload, values: dict[str, Any]) -> Callable[..., Any] | None:
+    """Return the function that computes an operator of ours from tensors of the device; None to run its kernel for the CPU.
+
+    The readable versions have no kernels: they run on the device.
+    """
     kernels = OPDEFS[operator._name.removesuffix(".default")]._backend_fns
     if "cuda" not in kernels:
         return kernels[None]
-    return kernels["cuda"] if _EMULATED else None
+    return kernels["cuda"] if _EMULATED or values.get("backend") == "reference" else None
 
 
 def install() -> None:
@@ -65,7 +68,7 @@ def install() -> None:
         for name, count in _CALLED_DIRECTLY.items():
             setattr(cuda, name, _on_cpu(name, getattr(cpu, name), count))
     original = backend.why_no_kernels
-    backend.why_no_kernels = lambda device_type: None if device_type == "cuda" else original(device_type)
+    backend.why_no_kernels = lambda device: None if torch.device(device).type == "cuda" else original(device)
 
 
 def _on_cpu(name: str, function: Callable[..., Any], launches: int) -> Callable[..., Any]:

@@ -292,6 +292,9 @@ def test_emulated_kernels_find_what_those_for_the_cpu_find_and_can_be_captured()
         given = [tensor.to(CUDA) for tensor in (points, transforms, *box)]
         with watch("without a capacity"):
             complete_search(*given, *settings, None, "auto")
+        with watch("reference"):
+            found = complete_search(*given, *settings, None, "reference")
+            assert len(found[0]) == len(wanted[0])
         with watch("with a capacity"):
             found = complete_search(*given, *settings, 64, "auto")
         roots = found[3].item()
@@ -313,6 +316,8 @@ def test_emulated_kernels_find_what_those_for_the_cpu_find_and_can_be_captured()
     report = run_on_pretend_gpu(code, emulated=True)
     (wait,) = report["without a capacity"].waits
     assert wait.startswith("copy int32[2] to the CPU: snarfcli/native/cuda_launches.py:")
+    assert report["reference"].mixing == []
+    assert report["reference"].kernels > 100  # operators of PyTorch
     for name in ("with a capacity", "replay"):
         assert (report[name].mixing, report[name].waits, report[name].copies) == ([], [], [])
     assert any(line.startswith("search_tame: snarfcli/") for line in report["with a capacity"].launches)

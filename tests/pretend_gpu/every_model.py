@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -123,19 +124,20 @@ def _evaluate(kind: str, avatar: Avatar, store: SampleStore) -> None:
     with watch(f"{kind}: metrics of surfaces and weights"), suppress(EmptySurface, FullSurface):
         measure_weights(avatar, store.template)
         measure_surfaces(avatar, [sequence], 1, _RESOLUTION)
-    pose = torch.zeros(1, avatar.skeleton.num_joints, 3)
-    for device in (torch.device("cpu"), CUDA):
-        points = torch.zeros(1, 9, 3, device=device)
-        with watch(f"{kind}: queries from {device.type}"):
-            avatar.occupancy(points, pose.to(device), torch.zeros(1, 3, device=device))
-            avatar.query(points, avatar.bone_transforms(pose), pose.to(device))
+    pose, points, translation = torch.zeros(1, avatar.skeleton.num_joints, 3), torch.zeros(1, 9, 3), torch.zeros(1, 3)
+    for places in product((torch.device("cpu"), CUDA), repeat=3):
+        names = ", ".join("GPU" if place == CUDA else "CPU" for place in places)
+        with watch(f"{kind}: queries with points, pose and translation on {names}"):
+            placed = [tensor.to(place) for tensor, place in zip((points, pose, translation), places, strict=True)]
+            avatar.occupancy(*placed)
+            avatar.query(placed[0], avatar.bone_transforms(*placed[1:]), placed[1])
 
 
 def _extract(kind: str, avatar: Avatar) -> None:
     pose = torch.full((avatar.skeleton.num_joints, 3), 0.1)
-    for name, given in (("the CPU", pose), ("the GPU", pose.to(CUDA))):
-        with watch(f"{kind}: mesh of a pose on {name}"):
-            _extracted(lambda given=given: avatar.mesh(given, given.new_zeros(3), resolution=_RESOLUTION))
+    for name, given in (("CPU", pose), ("GPU", pose.to(CUDA))):
+        with watch(f"{kind}: mesh of a pose on the {name}"):
+            _extracted(lambda given=given: avatar.mesh(given, torch.zeros(3, device=CUDA), resolution=_RESOLUTION))
     if avatar.has_skinning_weights:
         with watch(f"{kind}: skinned mesh"):
             _extracted(lambda: avatar.mesh(pose, resolution=_RESOLUTION, surface="skinned"))

@@ -14,7 +14,7 @@ KINDS = (*SYSTEMS, "voxel", "grids", "local", "broyden", "preset", "refined")
 """The systems, and kinds of fields, searches and training of fast_snarf (`every_model`)."""
 PARTS = (
     "start", "bootstrap step", "usual step", "step with upkeep", "validation", "checkpoint", "finish", "evaluation",
-    "metrics of surfaces and weights", "queries from cpu", "queries from cuda", "mesh of a pose on the CPU",
+    "metrics of surfaces and weights", "mesh of a pose on the CPU",
     "mesh of a pose on the GPU", "animation of the field surface", "viewer",
 )  # fmt: skip
 CODE = """

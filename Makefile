@@ -74,6 +74,7 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_data.py
 	$(VENV)/bin/python benchmarks/bm_training.py
 	$(VENV)/bin/python benchmarks/bm_optimizer.py
+	$(VENV)/bin/python benchmarks/bm_gpu_waits.py
 	$(VENV)/bin/python benchmarks/bm_evaluation.py
 	$(VENV)/bin/python benchmarks/bm_extraction.py
 	$(VENV)/bin/python benchmarks/bm_shape.py

@@ -29,18 +29,14 @@ _EMULATED = os.environ.get("SNARF_PRETEND_GPU_EMULATED") == "1"
 _CALLED_DIRECTLY = {"implicit_backward": 3}  # functions of native.cuda, and their numbers of kernels
 
 
-class _Launcher:
-    """Runs kernels of csrc/cuda, compiled as C++, in the memory of the tensors that the device's tensors hold."""
+class _Launcher(EmulatedGpu):
+    """Runs kernels of csrc/cuda, compiled as C++ in seconds, in the memory of the tensors that the device's tensors hold."""
 
-    def __init__(self, dtype: torch.dtype) -> None:
-        self._gpu = EmulatedGpu(dtype)  # compiles all kernels, in about three seconds
-
-    def threads(self, most: int) -> int:
-        return self._gpu.threads(most)
-
-    def launch(self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure) -> None:
+    def launch(
+        self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure, *rest: Any, **named: Any
+    ) -> None:
         given = type(arguments).from_buffer_copy(arguments)  # a graph keeps them as they are now
-        run = partial(self._gpu.launch, source, kernel, blocks, threads, given)
+        run = partial(super().launch, source, kernel, blocks, threads, given, *rest, **named)
         run()
         line = f"{kernel}: {current_line()}"
         note_kernels(line, 1)

@@ -15,7 +15,7 @@ __all__ = ["build_library", "why_no_pretend_gpu"]
 
 _SOURCE = Path(__file__).with_name("library.cpp")
 _TORCH = Path(torch.__file__).parent
-_OLDEST = (2, 9)  # PyTorch whose interfaces library.cpp implements
+_OLDEST = (2, 13)  # PyTorch whose interfaces library.cpp implements; older ones were not tried
 
 
 @cache

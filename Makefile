@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.snarf-installed
 SNARF := $(VENV)/bin/snarf
 SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
-C_FAMILY = $(shell find csrc tests/native tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
+C_FAMILY = $(shell find csrc tests/native tests/pretend_gpu tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
 
 .PHONY: help setup demo test fuzz trust sanitize lint format bench clean
 
@@ -70,10 +70,12 @@ format: $(INSTALLED)
 bench: export OMP_WAIT_POLICY = PASSIVE
 bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_search.py
+	$(VENV)/bin/python benchmarks/bm_balance.py
 	$(VENV)/bin/python benchmarks/bm_library.py
 	$(VENV)/bin/python benchmarks/bm_data.py
 	$(VENV)/bin/python benchmarks/bm_training.py
 	$(VENV)/bin/python benchmarks/bm_optimizer.py
+	$(VENV)/bin/python benchmarks/bm_gpu_waits.py
 	$(VENV)/bin/python benchmarks/bm_evaluation.py
 	$(VENV)/bin/python benchmarks/bm_extraction.py
 	$(VENV)/bin/python benchmarks/bm_shape.py

@@ -18,8 +18,9 @@ from snarfcli.avatar import Avatar
 from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.datasets.subjects import SequenceSpec
 from snarfcli.evaluation.surface_metrics import compare_surfaces, sample_surface
+from snarfcli.meshing.followed import Followed
 from snarfcli.meshing.mesh import Mesh
-from snarfcli.meshing.skinned import Followed, SkinnedSurface
+from snarfcli.meshing.skinned import SkinnedSurface
 from snarfcli.meshing.surfaces import field_surface
 from snarfcli.motions import builtin_motion
 from snarfcli.progress import progress
@@ -66,9 +67,10 @@ def _following(avatar: Avatar, skinned: SkinnedSurface, name: str) -> list[str]:
     before = raw_before = None
     for frame, pose in enumerate(poses):
         vertices = skinned.canonical_vertices(pose)
-        raw = skinned.mesh.vertices + skinned.spread(skinned.control.nearest_ways(pose)[0])[:, None] * skinned.mesh.normals
+        raw_ways = skinned.spread(skinned.control.nearest_ways(pose)[0]).cpu().numpy()
+        raw = skinned.mesh.vertices + raw_ways[:, None] * skinned.mesh.normals
         if frame % 10 == 0:
-            wanted = skinned.mesh.vertices + everywhere.ways(pose)[:, None] * skinned.mesh.normals
+            wanted = skinned.mesh.vertices + everywhere.ways(pose).cpu().numpy()[:, None] * skinned.mesh.normals
             apart.append(np.linalg.norm(vertices - wanted, axis=1))
         if before is not None:
             jumps += int((np.linalg.norm(vertices - before, axis=1) > _JUMP_M).sum())

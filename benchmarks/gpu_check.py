@@ -41,7 +41,8 @@ TOLERANCE, STEPS = SearchConfig().tolerance, SearchConfig().max_steps
 BROYDEN_M = (1e-4, 0.5)  # the released thresholds, metres
 TARGET_OVER_BROYDEN, TARGET_BACKWARD = 10, 2
 NUMBERS = torch.float32
-RECORD_BYTES, ROOT_BYTES, RESULT_BYTES, TRANSFORM_BYTES, POINT_BYTES = 304, 56, 56, 48, 12
+RECORD_BYTES, ROOT_BYTES, RESULT_BYTES, TRANSFORM_BYTES, POINT_BYTES = 320, 56, 56, 48, 12
+BOUNDS_BYTES, ENTRY_BYTES = 80, 16
 
 
 @dataclass
@@ -341,8 +342,10 @@ def bandwidth(report: Report, chosen: list[Case], repeats: int) -> None:
             "survey": nodes + records + queries * POINT_BYTES,
             "count_queries": queries * POINT_BYTES + bins,
             "place_queries": queries * POINT_BYTES + in_bins + 2 * bins,
-            "search_tame": records + bins + in_bins + roots * ROOT_BYTES,
-            "search_curved": bins + in_bins,
+            "search_cells": case.cells * BOUNDS_BYTES + bins + in_bins + roots * ENTRY_BYTES,
+            "search_rest": 0,
+            "halve_parts": 0,
+            "solve_parts": roots * (ENTRY_BYTES + POINT_BYTES + ROOT_BYTES) + records,
             "collect_roots": 8 * queries + 8 * roots,
             "write_roots": 8 * queries + roots * (ROOT_BYTES + RESULT_BYTES),
             "implicit_backward": roots * (12 + RESULT_BYTES + 8 * TRANSFORM_BYTES) + queries * POINT_BYTES,

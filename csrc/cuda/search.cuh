@@ -7,10 +7,18 @@
 #include "snarf/grid.h"
 #include "snarf/search.h"
 
+// The tests' emulation counts what the threads do; on a GPU this is nothing.
+#ifndef SNARF_COUNT
+#define SNARF_COUNT(what) ((void)0)
+#endif
+
 namespace snarf {
 namespace SNARF_ISA {
 
 typedef SNARF_NUMBER Number;
+
+constexpr int kThreads = 128;  // maximum number of threads per block, unless a kernel says otherwise
+constexpr int kLists = 5;      // of a complete search, see Entry in parts.cuh
 
 // Twelve numbers that move in 16-byte pieces: a blended transform, or a root with its inverse Jacobian.
 template <class S>
@@ -30,10 +38,14 @@ struct Search {
   const unsigned char* active;  // [all cells], or null
   const S* starts;              // [B, I, 12], posed to canonical, or canonical points [B, N, I, 3], metres (broyden)
   // Cells of the group.
-  S* records;        // [P, C], Record
-  int* list;         // [P, C]: numbers of the tame cells from the front, of the others from the back
-  int* listed;       // [P, 2]: number of each
+  S* bounds;         // [P, C], Bounds
+  S* polynomials;    // [P, C], Polynomial
+  int* units;        // [P, C + cuts, 4], Unit: those of the tame cells from the front, of the others from the back
+  int* listed;       // [P, 3]: number of each, and of the cuts that were wanted
   unsigned* region;  // [P, 12]: ordered() bounds of the cells' boxes and of the queries: upper, -lower each
+  int* entries;      // Entry, in kLists lists: list k is entries[list_begin[k] .. list_begin[k + 1] - 1]
+  int* entered;      // [kLists]: number in each list; may exceed its room
+  int* stopped;      // [P, blocks of search_cells]: the chunk that found a list full, or -1
   // Queries of the group's poses, sorted into bins.
   int* bin_count;      // [P, bins]
   const int* bin_end;  // [P * bins]: running sum of bin_count
@@ -48,18 +60,21 @@ struct Search {
   int* kept;        // [B * N]: roots of each query without duplicates
   const int* end;   // [B * N]: running sum of `kept`
   // Results.
-  S* canonical;                  // [capacity, 3]
-  long long* query;              // [capacity]
-  S* jacobian_inverse;           // [capacity, 9]
-  long long* found;              // [1]: may exceed `capacity`; null if not wanted
-  long long count;               // N
-  long long queries;             // B N
+  S* canonical;         // [capacity, 3]
+  long long* query;     // [capacity]
+  S* jacobian_inverse;  // [capacity, 9]
+  long long* found;     // [1]: may exceed `capacity`; null if not wanted
+  long long count;      // N
+  long long queries;    // B N
+  long long list_begin[kLists + 1];
   double tolerance, divergence;  // as shares of the grid's longest side
   double same_root;              // as a share of a cell's shortest side
   int nodes[3];                  // W, H, D
   int first_pose, first_cell;    // of the group
   int cells;                     // C
   int bins;                      // most bins of a pose
+  int cuts;                      // most cuts of a pose's cells into units
+  int level;                     // of the parts that are halved
   int slots, capacity;
   int start_count;  // I
   int starts_are_points;

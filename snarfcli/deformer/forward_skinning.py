@@ -121,7 +121,8 @@ class ForwardSkinning(FieldOnGrid):
         self._check_poses(bone_transforms[None])
         self._check_cells("cells", cells)
         lower, upper = self._box_of_nodes(bone_transforms[None], cells)
-        return lower[0].cpu(), upper[0].cpu()
+        lower, upper = torch.stack([lower[0], upper[0]]).cpu()  # one copy from a GPU
+        return lower, upper
 
     def _box_of_nodes(self, bone_transforms: Tensor, cells: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the corners, [B, 3] each, of boxes around the images of `cells`, or of the active cells if None."""

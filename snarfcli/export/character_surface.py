@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
+from torch import Tensor
 
 from snarfcli.errors import UserError
 from snarfcli.export.character import CharacterOptions
@@ -56,12 +54,12 @@ class _FixedSurface(SkinnedSurface):
 
     def __init__(self, surface: SkinnedSurface) -> None:
         vars(self).update(vars(surface))
-        self._vertices: NDArray[np.float32] | None = None
+        self._shape: Tensor | None = None
 
-    def canonical_vertices(self, pose: torch.Tensor) -> NDArray[np.float32]:
-        if self._vertices is None:
-            self._vertices = super().canonical_vertices(pose)
-        return self._vertices
+    def shape_in(self, pose: Tensor) -> Tensor:
+        if self._shape is None:
+            self._shape = super().shape_in(pose)
+        return self._shape
 
 
 def _decimated(mesh: Mesh, triangles: int) -> Mesh:

@@ -14,7 +14,7 @@ __all__ = ["RESOLUTIONS", "SURFACES", "posed_mesh"]
 SURFACES = ("field", "skinned")
 """Kinds of surfaces: the surface of the posed field, and the canonical mesh moved by linear blend skinning."""
 RESOLUTIONS = (16, 1024)
-"""Range of voxels along the longest side. Lattices are dense: 1024 takes about 4 GB for a body with spread arms."""
+"""Range of voxels along the longest side. Lattices are dense: 1024 takes about 3 GB for a body with spread arms."""
 
 
 def posed_mesh(

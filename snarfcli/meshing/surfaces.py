@@ -41,7 +41,7 @@ def field_surface(
     *,
     weights_from: Mesh | None = None,
     keep_share: float = 0.01,
-    chunk: int = 65536,
+    chunk: int | None = None,
     transforms: Tensor | None = None,
 ) -> Mesh:
     """Extract the surface of the posed occupancy: the union over all correspondences, watertight (S Eq. 9).
@@ -54,21 +54,19 @@ def field_surface(
         weights_from: canonical mesh with weights (`canonical_surface`); each vertex then gets the weights of the nearest
             vertex of this mesh in the same pose that faces the same way.
         keep_share: see `extract_surface`.
-        chunk: maximum number of points per query.
+        chunk: maximum number of points per query; see `extract_surface`.
         transforms: [J, 4, 4], canonical to posed, metres, instead of those of the pose; for joints that stretch.
 
     Raises:
         EmptySurface, FullSurface: the field has no surface.
     """
     pose, transforms = check_posed(avatar, pose, translation, transforms)
-    lower, upper = avatar.posed_box(transforms)
+    pose, transforms = pose.to(avatar.device), transforms.to(avatar.device)
 
     def posed_logits(points: Tensor) -> Tensor:
-        return limited(avatar.query(points[None], transforms[None], pose[None]).logits[0])
+        return avatar.query(points[None], transforms[None], pose[None]).logits[0]
 
-    mesh = extract_surface(
-        posed_logits, lower, upper, resolution, dilate=_DILATE, widen=True, keep_share=keep_share, chunk=chunk
-    ).with_normals()
+    mesh = _extract(avatar, posed_logits, avatar.posed_box(transforms), resolution, keep_share, chunk)
     return mesh if weights_from is None else replace(mesh, weights=_borrow_weights(avatar, transforms, mesh, weights_from))
 
 
@@ -79,7 +77,7 @@ def canonical_surface(
     resolution: int = 128,
     *,
     keep_share: float = 0.01,
-    chunk: int = 65536,
+    chunk: int | None = None,
 ) -> Mesh:
     """Extract the canonical surface under the condition of `pose` [J, 3], with exact skinning weights; see `field_surface`.
 
@@ -87,16 +85,34 @@ def canonical_surface(
         EmptySurface, FullSurface: the field has no surface.
         ValueError: the avatar has no skinning weights.
     """
-    lower, upper = avatar.canonical_box()
+    pose = pose.to(avatar.device)
 
     def canonical_logits(points_c: Tensor) -> Tensor:
-        return limited(avatar.canonical_logits(points_c, pose))
+        return avatar.canonical_logits(points_c, pose)
 
-    mesh = extract_surface(
-        canonical_logits, lower, upper, resolution, dilate=_DILATE, widen=True, keep_share=keep_share, chunk=chunk
+    mesh = _extract(avatar, canonical_logits, avatar.canonical_box(), resolution, keep_share, chunk)
+    return replace(mesh, weights=in_chunks(avatar.skinning_weights, mesh.vertices))
+
+
+def _extract(
+    avatar: TrainedField,
+    logits: Callable[[Tensor], Tensor],
+    box: tuple[Tensor, Tensor],
+    resolution: int,
+    keep_share: float,
+    chunk: int | None,
+) -> Mesh:
+    """Extract the surface of logits in a box (lower [3], upper [3]) on the avatar's device."""
+    return extract_surface(
+        lambda points: limited(logits(points)),
+        *box,
+        resolution,
+        dilate=_DILATE,
+        widen=True,
+        keep_share=keep_share,
+        chunk=chunk,
+        device=avatar.device,
     )
-    weights = in_chunks(avatar.skinning_weights, mesh.vertices)
-    return replace(mesh, weights=weights).with_normals()
 
 
 def check_posed(

@@ -36,7 +36,9 @@ def complete_search(
     """Find the roots of T(x) [x; 1] = x' in every active cell; see `ops.complete_search` for arguments and results.
 
     The results do not depend on how the work was divided on the device: the same input gives the same bits. If there are more
-    roots than `capacity`, it is not determined which of them are returned.
+    roots than `capacity`, it is not determined which of them are returned. The work is spread evenly over the device by lists
+    whose length depends on the number of queries and on `capacity`; where folds fill them, as no body measured did, no root is
+    lost, but the search takes longer and the last bits of roots may vary.
 
     Raises:
         ValueError: 2^31 queries or cells, or more.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from ctypes import Structure, c_double, c_int, c_longlong, c_void_p
+from itertools import accumulate
 from math import prod
 
 import torch
@@ -13,15 +14,18 @@ from snarfcli.native.cuda_driver import KernelLauncher
 
 __all__ = ["run_backward", "run_broyden", "run_complete"]
 
-_RECORD_NUMBERS = 76  # of one cell: polynomial and bounds (csrc/cuda/complete.cu)
+_BOUNDS_NUMBERS, _POLYNOMIAL_NUMBERS = 20, 60  # of one cell (csrc/cuda/parts.cuh)
+_UNIT_INTEGERS = _ENTRY_INTEGERS = 4
+_RECORD_NUMBERS = _BOUNDS_NUMBERS + _POLYNOMIAL_NUMBERS
 _GROUP_BYTES = 1 << 28  # maximum memory for the records of cells that are searched together
 _MOST_POSES = 65_535  # of a group: blocks of a grid along y
 _MOST_BINS = 1 << 20  # of a pose; a bin costs about as much as a query
 _FEWEST_BINS = 64
 _THREADS = 128
-_CURVED_THREADS = 64
+_CELL_THREADS = 32  # per block of search_cells
 _QUERY_BLOCKS = 256  # blocks that measure the queries; more would only queue for the same few atomics
-_CURVED_BLOCKS = 1024  # per pose; each works on several cells in turn
+_WARPS = 4224  # that keep a large GPU busy: 32 on each of 132 multiprocessors
+_LEVELS = 4  # kLevels of csrc/include/snarf/search.h
 _SAME_ROOT = 5e-3  # kSameRoot and kSameBroydenRoot of csrc/include/snarf/search.h
 _SAME_BROYDEN_ROOT = 5e-2
 _LIMIT = 2**31
@@ -32,14 +36,17 @@ class _Search(Structure):
 
     _fields_ = [
         *((name, c_void_p) for name in ("points", "transforms", "lower", "upper", "active", "starts")),
-        *((name, c_void_p) for name in ("records", "list", "listed", "region")),
+        *((name, c_void_p) for name in ("bounds", "polynomials", "units", "listed", "region")),
+        *((name, c_void_p) for name in ("entries", "entered", "stopped")),
         *((name, c_void_p) for name in ("bin_count", "bin_end", "sorted", "sorted_query")),
         *((name, c_void_p) for name in ("root", "root_order", "root_next", "staged", "head", "kept", "end")),
         *((name, c_void_p) for name in ("canonical", "query", "jacobian_inverse", "found")),
         *((name, c_longlong) for name in ("count", "queries")),
+        ("list_begin", c_longlong * (_LEVELS + 2)),
         *((name, c_double) for name in ("tolerance", "divergence", "same_root")),
         ("nodes", c_int * 3),
-        *((name, c_int) for name in ("first_pose", "first_cell", "cells", "bins", "slots", "capacity", "start_count")),
+        *((name, c_int) for name in ("first_pose", "first_cell", "cells", "bins", "cuts", "level")),
+        *((name, c_int) for name in ("slots", "capacity", "start_count")),
         *((name, c_int) for name in ("starts_are_points", "max_steps", "exact_jacobian", "orientation_preserving")),
     ]
 
@@ -98,27 +105,60 @@ def run_complete(
 
 def _search_group(launcher: KernelLauncher, points: Tensor, arguments: _Search, poses: int) -> None:
     """Find the roots of `poses` poses in the cells named by the arguments."""
-    count, cells, bins = points.shape[1], arguments.cells, arguments.bins
-    threads, curved_threads = launcher.threads(_THREADS), launcher.threads(_CURVED_THREADS)
+    count, cells, bins, cuts = points.shape[1], arguments.cells, arguments.bins, _most_cuts(points.shape[1])
     whole = {"dtype": torch.int32, "device": points.device}
     # All that starts at zero is one buffer, filled by one kernel.
-    region, listed, bin_count = torch.zeros(poses * (14 + bins), **whole).split([12 * poses, 2 * poses, poses * bins])
-    bin_end, cell_list = torch.empty_like(bin_count), torch.empty(poses * cells, **whole)
-    records = points.new_empty(poses * cells, _RECORD_NUMBERS)
+    zeros = torch.zeros(poses * (15 + bins) + _LEVELS + 1, **whole)
+    region, listed, bin_count, entered = zeros.split([12 * poses, 3 * poses, poses * bins, _LEVELS + 1])
+    bin_end, units = torch.empty_like(bin_count), torch.empty(poses * (cells + cuts), _UNIT_INTEGERS, **whole)
+    bounds = points.new_empty(poses * cells, _BOUNDS_NUMBERS)
+    polynomials = points.new_empty(poses * cells, _POLYNOMIAL_NUMBERS)
     in_bins, in_bins_query = points.new_empty(poses * count, 3), torch.empty(poses * count, **whole)
+    list_begin = list(accumulate(_rooms(poses * count, arguments.slots), initial=0))
+    entries = torch.empty(list_begin[-1], _ENTRY_INTEGERS, **whole)
+    cell_warps = _blocks(_WARPS, poses)
+    stopped = torch.empty(poses * cell_warps, **whole)
     arguments.region, arguments.listed, arguments.bin_count = region.data_ptr(), listed.data_ptr(), bin_count.data_ptr()
-    arguments.bin_end, arguments.list, arguments.records = bin_end.data_ptr(), cell_list.data_ptr(), records.data_ptr()
-    arguments.sorted, arguments.sorted_query = in_bins.data_ptr(), in_bins_query.data_ptr()
+    arguments.bounds, arguments.polynomials, arguments.units = bounds.data_ptr(), polynomials.data_ptr(), units.data_ptr()
+    arguments.bin_end, arguments.sorted, arguments.sorted_query = (
+        bin_end.data_ptr(),
+        in_bins.data_ptr(),
+        in_bins_query.data_ptr(),
+    )
+    arguments.entries, arguments.entered, arguments.stopped = entries.data_ptr(), entered.data_ptr(), stopped.data_ptr()
+    arguments.cuts, arguments.list_begin[:] = cuts, list_begin
+    threads, cell_threads = launcher.threads(_THREADS), launcher.threads(_CELL_THREADS)
 
-    def launch(kernel: str, blocks: int, block_threads: int = threads) -> None:
-        launcher.launch("complete", kernel, (blocks, poses), block_threads, arguments)
+    def launch(source: str, kernel: str, blocks: tuple[int, int], block_threads: int = threads) -> None:
+        launcher.launch(source, kernel, blocks, block_threads, arguments)
 
-    launch("survey", _blocks(cells, threads) + min(_blocks(count, threads), _QUERY_BLOCKS))
-    launch("count_queries", _blocks(count, threads))
+    cell_blocks, query_blocks = _blocks(cells, threads), _blocks(count, threads)
+    launch("complete", "survey", (cell_blocks + min(query_blocks, _QUERY_BLOCKS), poses))
+    launch("complete", "count_queries", (query_blocks, poses))
     torch.cumsum(bin_count, 0, dtype=torch.int32, out=bin_end)
-    launch("place_queries", _blocks(count, threads))
-    launch("search_tame", _blocks(cells, threads))
-    launch("search_curved", min(_blocks(8 * cells, curved_threads), _CURVED_BLOCKS), curved_threads)
+    launch("complete", "place_queries", (cell_blocks + query_blocks, poses))
+    launch("candidates", "search_cells", (cell_warps, poses), cell_threads)
+    launch("candidates", "search_rest", (cell_warps, poses), cell_threads)
+    full = _blocks(_WARPS * _CELL_THREADS, threads)
+    for level in range(1, _LEVELS):
+        arguments.level, room = level, list_begin[level + 1] - list_begin[level]
+        launch("parts", "halve_parts", (min(_blocks(8 * room, threads), full), 1))
+    launch("parts", "solve_parts", (min(_blocks(list_begin[1], threads), full), 1))
+
+
+def _most_cuts(count: int) -> int:
+    """Return how many cuts of crowded cells there is room for, given the queries of a pose; without room a cell stays whole."""
+    return count // 8 + 1024
+
+
+def _rooms(queries: int, slots: int) -> list[int]:
+    """Return the lengths of the lists of entries: to be solved, of each level to be halved, and of the last level.
+
+    Measured on bodies in extreme poses (benchmarks/bm_balance.py): at most 1.1 entries to be solved for each root reported, and
+    0.16, 0.03, 0.007 and 0.004 of the other lists for each query. Entries without room are searched all the same, slowly.
+    """
+    to_halve = [queries >> level for level in range(1, _LEVELS)]
+    return [room + 4096 for room in (max(queries, slots) + queries // 4, *to_halve, to_halve[-1])]
 
 
 def run_broyden(

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 from snarfcli.meshing.colors import weights_to_colors
+from snarfcli.meshing.components import count_components
 from snarfcli.meshing.extract import EmptySurface, FullSurface
-from snarfcli.meshing.mesh import Mesh, keep_components
+from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.mesh_files import read_mesh, write_mesh
 from snarfcli.meshing.posed import posed_mesh
 from snarfcli.meshing.skinned import skinned_surface
@@ -122,7 +123,7 @@ class Animation:
             mesh = read_mesh(file) if self.screen else None
             if mesh is not None:
                 frame.vertices = len(mesh.vertices)
-                frame.components = keep_components(mesh.vertices, mesh.faces, 0.0)[3] if self.surface == "field" else 0
+                frame.components = count_components(mesh.faces, len(mesh.vertices)) if self.surface == "field" else 0
         else:
             mesh = self._extract(index, frame)
             if file and mesh is not None:

@@ -342,8 +342,8 @@ def test_without_weights_or_motions_there_is_no_character(toy, tmp_path, monkeyp
 
 def test_a_shape_without_condition_is_looked_for_once(tmp_path, monkeypatch):
     toy = ToyCharacter(bulge=0.0)
-    follow, calls = SkinnedSurface.canonical_vertices, []
-    monkeypatch.setattr(SkinnedSurface, "canonical_vertices", lambda self, pose: calls.append(0) or follow(self, pose))
+    follow, calls = SkinnedSurface.shape_in, []
+    monkeypatch.setattr(SkinnedSurface, "shape_in", lambda self, pose: calls.append(0) or follow(self, pose))
     counts, files = [], []
     for name in ("global", "none"):
         toy.config.condition.name = name

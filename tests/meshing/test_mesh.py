@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from snarfcli.meshing.mesh import Mesh, face_components, keep_components, vertex_normals
+from snarfcli.meshing.mesh import Mesh, vertex_normals
 
 
 def test_normals_of_a_sphere_point_outward():
@@ -17,18 +17,6 @@ def test_normals_of_a_sphere_point_outward():
 def test_a_vertex_without_faces_has_a_unit_normal():
     normals = vertex_normals(np.eye(4, 3), np.array([[0, 1, 2]]))
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-6)
-
-
-def test_components_are_numbered_by_size():
-    small, large = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.icosphere(subdivisions=2)
-    vertices = np.concatenate([small.vertices, large.vertices + 5])
-    faces = np.concatenate([small.faces, large.faces + len(small.vertices)])
-    labels = face_components(faces, len(vertices))
-    np.testing.assert_array_equal(labels, np.repeat([1, 0], [len(small.faces), len(large.faces)]))
-    kept_vertices, kept_faces, found, kept = keep_components(vertices, faces, 0.5)
-    assert (found, kept) == (2, 1)
-    np.testing.assert_array_equal(kept_vertices[kept_faces], large.vertices[large.faces] + 5)
-    assert face_components(np.zeros((0, 3), int), 0).shape == (0,)
 
 
 @pytest.mark.parametrize(

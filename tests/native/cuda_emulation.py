@@ -7,9 +7,11 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from snarfcli.native.cuda_compile import cuda_sources
@@ -22,9 +24,10 @@ _PROGRAMS = {"network": "network"}  # files of emulation/ with the kernels of a 
 
 
 class EmulatedGpu:
-    """A launcher whose blocks have up to `block` threads, each a thread of the operating system; 1 is fastest.
+    """A launcher whose blocks have up to `block` threads; 1 is fastest. Blocks of the network have as many as on a GPU.
 
-    Blocks of the network have as many as on a GPU.
+    `work` has what the blocks of each launch did, by kernel: int64 [blocks, 2, 3] with the sum over a block's threads and the
+    most of one thread, of rounds (in which the block's threads take a candidate each), halvings of a cell and Newton solves.
     """
 
     capability = (9, 0)
@@ -35,6 +38,7 @@ class EmulatedGpu:
         self.dtype = dtype
         self.block = block
         self.launches: list[str] = []
+        self.work: dict[str, list[np.ndarray]] = defaultdict(list)
 
     def threads(self, most: int) -> int:
         return min(most, self.block)
@@ -54,6 +58,8 @@ class EmulatedGpu:
         assert min(blocks) > 0
         library = build_emulation(self.dtype, _PROGRAMS.get(source, "emulation"))
         assert library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
+        counted = np.ctypeslib.as_array(library.work_of_blocks(), (blocks[0] * blocks[1], 2, 3))
+        self.work[kernel].append(counted.copy())
 
 
 def host_compiler() -> str | None:
@@ -69,8 +75,8 @@ def build_emulation(dtype: torch.dtype, program: str = "emulation") -> ctypes.CD
         dtype: type of all numbers.
         program: file of emulation/, without its ending.
 
-    SNARF_EMULATION_FLAGS adds flags to the compiler. Races show with
-    LD_PRELOAD=$(g++ -print-file-name=libtsan.so) SNARF_EMULATION_FLAGS=-fsanitize=thread.
+    SNARF_EMULATION_FLAGS adds flags to the compiler. With LD_PRELOAD=$(g++ -print-file-name=libtsan.so)
+    SNARF_EMULATION_FLAGS=-fsanitize=thread the threads of a block run at the same time, and races are reported.
     """
     return _build(dtype, program)
 
@@ -92,4 +98,5 @@ def _build(dtype: torch.dtype, program: str) -> ctypes.CDLL:
     structures = ("search", "backward", "optimizer", "optimizer_task")
     for structure in structures if program == "emulation" else ("packing", "evaluation"):
         getattr(loaded, f"{structure}_bytes").restype = ctypes.c_size_t
+    loaded.work_of_blocks.restype = ctypes.POINTER(ctypes.c_longlong)
     return loaded

@@ -115,9 +115,10 @@ def test_constants_are_those_of_the_headers():
     shared = (cuda_compile.cuda_sources() / "include" / "snarf" / "search.h").read_text()
     assert f"kSameRoot = {cuda_launches._SAME_ROOT:.0e};".replace("e-0", "e-") in shared
     assert f"kSameBroydenRoot = {cuda_launches._SAME_BROYDEN_ROOT:.0e};".replace("e-0", "e-") in shared
-    complete = (cuda_compile.cuda_sources() / "cuda" / "complete.cu").read_text()
-    assert f"kThreads = {cuda_launches._THREADS};" in complete
-    assert f"kCurvedThreads = {cuda_launches._CURVED_THREADS};" in complete
+    assert f"kLevels = {cuda_launches._LEVELS};" in shared
+    cuda = cuda_compile.cuda_sources() / "cuda"
+    assert f"kThreads = {cuda_launches._THREADS};" in (cuda / "search.cuh").read_text()
+    assert f"kCellThreads = {cuda_launches._CELL_THREADS};" in (cuda / "candidates.cu").read_text()
 
 
 def test_functions_take_what_the_operators_take():
@@ -225,9 +226,9 @@ def test_roots_on_faces_come_once(runner):
 @pytest.mark.parametrize("block", [3, 8])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 def test_result_does_not_depend_on_the_size_of_a_block(emulated, block, dtype, monkeypatch):
-    # Real threads: a missing barrier, a race on shared memory or a wrong share of the work would show. Leaving out
-    # any one barrier of complete.cu is reported here by ThreadSanitizer (build_emulation() tells how to use it).
-    monkeypatch.setattr(cuda_launches, "_CURVED_BLOCKS", 2)  # that take turns
+    # A wrong share of the work would show, and a barrier that some threads miss. ThreadSanitizer reports races here
+    # (build_emulation() tells how to use it).
+    monkeypatch.setattr(cuda_launches, "_WARPS", 2)  # that take turns
     points, poses, _weights, grid, transforms = scene(24, 0.8, dtype, batch=2, count=150, shape=(3, 4, 4))
     one = emulated.complete(points, transforms, grid, (3, 4, 4))
     assert len(one[1]) > 300

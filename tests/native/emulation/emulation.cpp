@@ -2,27 +2,31 @@
 #include "entries.h"
 
 #include "broyden.cu"
+#include "candidates.cu"
 #include "complete.cu"
 #include "gather.cu"
 #include "implicit.cu"
 #include "optimizer.cu"
+#include "parts.cu"
 
 namespace {
 
 using namespace snarf::device;
 
-const Entry<const Search<Number>> search_kernels[] = {
+const NamedKernel<const Search<Number>> search_kernels[] = {
     {"survey", survey},
     {"count_queries", count_queries},
     {"place_queries", place_queries},
-    {"search_tame", search_tame},
-    {"search_curved", search_curved},
+    {"search_cells", search_cells},
+    {"search_rest", search_rest},
+    {"halve_parts", halve_parts},
+    {"solve_parts", solve_parts},
     {"search_from_starts", search_from_starts},
     {"collect_roots", collect_roots},
     {"write_roots", write_roots},
 };
-const Entry<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
-const Entry<const AdamLaunch> optimizer_kernels[] = {
+const NamedKernel<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
+const NamedKernel<const AdamLaunch> optimizer_kernels[] = {
     {"check_gradients", check_gradients},
     {"update_parameters", update_parameters},
 };

@@ -4,18 +4,23 @@
 #include "cuda_shim.h"
 
 template <class Arguments>
-struct Entry {
+struct NamedKernel {
   const char* name;
   void (*kernel)(Arguments);
 };
 
+static std::vector<Work> last_work;  // of the last launch, by block
+
 template <class Arguments, size_t count>
-bool run_named(const Entry<Arguments> (&entries)[count], const char* name, const void* arguments, unsigned x, unsigned y,
+bool run_named(const NamedKernel<Arguments> (&entries)[count], const char* name, const void* arguments, unsigned x, unsigned y,
                unsigned threads) {
   for (const auto& entry : entries)
     if (!strcmp(entry.name, name)) {
-      run_grid(entry.kernel, *static_cast<const Arguments*>(arguments), x, y, threads);
+      run_grid(entry.kernel, *static_cast<const Arguments*>(arguments), x, y, threads, last_work);
       return true;
     }
   return false;
 }
+
+// What the blocks of the last launch did, [blocks, 2, 3]: sum over the threads and the most of one; rounds, halvings, solves.
+extern "C" const long long* work_of_blocks() { return &last_work.data()->rounds; }

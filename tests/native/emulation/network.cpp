@@ -9,12 +9,12 @@ namespace {
 
 using namespace snarf::device;
 
-const Entry<const Packing> packing_kernels[] = {
+const NamedKernel<const Packing> packing_kernels[] = {
     {"pack_float32", pack_float32},
     {"pack_tf32", pack_tf32},
     {"pack_bfloat16", pack_bfloat16},
 };
-const Entry<const Evaluation> evaluation_kernels[] = {
+const NamedKernel<const Evaluation> evaluation_kernels[] = {
     {"evaluate_float32_64", evaluate_float32_64},   {"evaluate_float32_128", evaluate_float32_128},
     {"evaluate_tf32_64", evaluate_tf32_64},         {"evaluate_tf32_128", evaluate_tf32_128},
     {"evaluate_bfloat16_64", evaluate_bfloat16_64}, {"evaluate_bfloat16_128", evaluate_bfloat16_128},

@@ -19,10 +19,16 @@ const T& __ldg(const T* at) {
 constexpr unsigned kSharedBytes = 227 * 1024;  // of a block on Hopper
 constexpr unsigned kWarp = 32, kMostWarps = 16;
 
-struct WarpBarrier : Barrier {
-  WarpBarrier() : Barrier(kWarp) {}
+#ifdef __SANITIZE_THREAD__
+struct WarpBarrier : Block {
+  WarpBarrier() : Block(kWarp) {}
 };
 inline WarpBarrier warp_barriers[kMostWarps];
+inline void wait_for_warp(unsigned warp) { warp_barriers[warp].wait(); }
+#else
+// Fibers have barriers of whole blocks. All warps of the network's kernels multiply as often between two of these.
+inline void wait_for_warp(unsigned) { running_block->wait(); }
+#endif
 
 // What the lanes of a warp give to their tensor cores. Two, used in turn, so that one barrier is enough: a lane is at most one
 // product ahead of the others.
@@ -73,7 +79,7 @@ void add_products(float (*sums)[4][4], const uint4* left, const uint4* right) {
   Given& here = given[warp][products_so_far[threadIdx.x]++ % 2];
   for (int m = 0; m < kTall; ++m) here.left[lane][m] = left[m];
   for (int i = 0; i < 2; ++i) here.right[lane][i] = right[i];
-  warp_barriers[warp].wait();
+  wait_for_warp(warp);
   for (int n = 0; n < 4; ++n)
     for (int r = 0; r < 4; ++r) {
       const int row = int(lane) / 4 + 8 * (r / 2), column = 2 * int(lane % 4) + r % 2;

@@ -28,6 +28,7 @@ LAYERS = (
         "array_files",
         "checks",
         "descriptions",
+        "draws",
         "formats",
         "hydra_config",
         "native",

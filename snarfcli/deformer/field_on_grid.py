@@ -14,6 +14,7 @@ from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinea
 from snarfcli.deformer.roots import is_costly_to_read
 from snarfcli.deformer.variation import total_variation
 from snarfcli.deformer.weights import GridWeights, NetworkWeights, NodeWeights, WeightField
+from snarfcli.draws import Draws
 
 __all__ = ["FieldOnGrid"]
 
@@ -278,11 +279,11 @@ class FieldOnGrid(nn.Module):
         cell, local = locate(canonical, self.grid, self.shape)
         return ((local >= 0) & (local <= 1)).all(1) & self.active_cells.reshape(-1)[cell]
 
-    def random_canonical(self, count: int, generator: torch.Generator) -> Tensor:
+    def random_canonical(self, count: int, draws: Draws) -> Tensor:
         """Return canonical points [count, 3] spread evenly over the active cells, metres."""
         cells = self.active_cells.nonzero()
-        chosen = torch.randint(len(cells), (count,), generator=generator).to(cells.device)
-        places = torch.rand(count, 3, generator=generator).to(self.lower)
+        chosen = draws.integers(len(cells), count)
+        places = draws.uniform(count, 3).to(self.lower)
         return self.lower + (cells[chosen].flip(1) + places) * self.grid.cell_size(self.shape)
 
 

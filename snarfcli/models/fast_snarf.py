@@ -17,6 +17,7 @@ from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, Forward
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.skinning import skin
 from snarfcli.deformer.weights import VoxelWeights
+from snarfcli.draws import Draws
 from snarfcli.models.pieces import floating_cells
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.symmetry import find_mirror
@@ -280,7 +281,7 @@ class FastSnarf(System):
         self,
         bone_transforms: Tensor,
         pose: Tensor,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: FoundRoots | None = None,
     ) -> dict[str, Tensor]:
@@ -294,7 +295,7 @@ class FastSnarf(System):
         pose: Tensor,
         made_up: Tensor,
         count: int,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: FoundRoots | None = None,
     ) -> Tensor | None:
@@ -305,13 +306,13 @@ class FastSnarf(System):
         """
         if not self.shape.conditioned:
             return None
-        canonical = self.deformer.random_canonical(count, generator)
+        canonical = self.deformer.random_canonical(count, draws)
         weights = self._weights_seen(canonical, None if found is None else found.weights)
         with torch.no_grad():
             known = torch.stack([self._logits_in(one, canonical, weights, precision) for one in self.condition(pose)])
             inside = known.amin(0) > _SURE_LOGIT
             sure = (inside | (known.amax(0) < -_SURE_LOGIT)).nonzero()[:, 0]
-        index = torch.randint(len(made_up), (len(sure),), generator=generator).to(sure.device)
+        index = draws.integers(len(made_up), len(sure))
         seen = None if weights is None else weights[sure]
         logits = self.canonical_logits(canonical[sure], self.condition(made_up), index, precision, seen)
         return F.binary_cross_entropy_with_logits(logits, inside[sure].to(logits), reduction="sum") / count
@@ -322,11 +323,9 @@ class FastSnarf(System):
         return self.canonical_logits(canonical, condition[None], one, precision, weights)
 
     @torch.no_grad()
-    def far_points(
-        self, count: int, bone_transforms: Tensor, generator: torch.Generator, weights: NodeWeights | None = None
-    ) -> Tensor:
+    def far_points(self, count: int, bone_transforms: Tensor, draws: Draws, weights: NodeWeights | None = None) -> Tensor:
         """Return random points of the searched cells, moved by the poses."""
-        canonical = self.deformer.random_canonical(count, generator)
+        canonical = self.deformer.random_canonical(count, draws)
         # without `weights`, the field itself at the points: to interpolate it, it would be evaluated at every node
         chosen = self.deformer.field(canonical) if weights is None else weights.at(canonical)
         return skin(canonical, chosen, bone_transforms)

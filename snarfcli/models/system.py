@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid, NodeWeights, SearchConfig
 from snarfcli.deformer.skinning import skin
+from snarfcli.draws import Draws
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.precision import network_precision
 from snarfcli.shape import CONDITIONS, OccupancyNetwork, joints_of_bones
@@ -215,7 +216,7 @@ class System(nn.Module):
         self,
         bone_transforms: Tensor,
         pose: Tensor,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: Found | None = None,
     ) -> dict[str, Tensor]:
@@ -224,7 +225,7 @@ class System(nn.Module):
         Args:
             bone_transforms: [B, J, 4, 4].
             pose: [B, J, 3].
-            generator: of random numbers.
+            draws: random numbers.
             precision: of the networks.
             found: from `find` with the same parameters; what it has evaluated is then not evaluated again.
         """
@@ -235,7 +236,7 @@ class System(nn.Module):
         pose: Tensor,
         made_up: Tensor,
         count: int,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: Found | None = None,
     ) -> Tensor | None:
@@ -245,14 +246,14 @@ class System(nn.Module):
             pose: [B, J, 3], of training frames.
             made_up: [P, J, 3].
             count: number of canonical points.
-            generator: of random numbers.
+            draws: random numbers.
             precision: of the network.
             found: from `find` with the same parameters; what it has evaluated is then not evaluated again.
         """
         return None
 
     def far_points(
-        self, count: int, bone_transforms: Tensor, generator: torch.Generator, weights: NodeWeights | None = None
+        self, count: int, bone_transforms: Tensor, draws: Draws, weights: NodeWeights | None = None
     ) -> Tensor | None:
         """Return posed points [B, count, 3] where the field may be occupied, also away from samples; None if not known.
 

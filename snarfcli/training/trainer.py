@@ -18,6 +18,7 @@ from torch.nn import functional as F
 from snarfcli.bodies.extent import bone_owners, bone_segments
 from snarfcli.deformer import NodeWeights
 from snarfcli.descriptions import DescriptionError, check_plain
+from snarfcli.draws import Draws, GeneratorDraws
 from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.evaluation.metrics import iou
 from snarfcli.fitting import PoseRefiner, require_refinable
@@ -112,7 +113,7 @@ class Trainer:
             losses |= self._bootstrap_losses(batch, found)
         if self.config.agreement_weight > 0 and self._is_due(self.config.agreement_every):
             losses |= self._agreement_loss(batch, found)
-        losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._generator(5), self.config.precision, found)
+        losses |= self.model.extra_losses(batch.bone_transforms, batch.pose, self._draws(5), self.config.precision, found)
         total = reduce(torch.add, losses.values())
         self._check_finite("loss", total.item())
         self.optimizer.zero_gradients()
@@ -167,9 +168,9 @@ class Trainer:
                 f"{self.config.learning_rate:g}, and start again with overwrite=true"
             )
 
-    def _generator(self, purpose: int) -> torch.Generator:
-        """Return the random generator for one purpose in the coming step."""
-        return torch.Generator().manual_seed(self._seed(purpose))
+    def _draws(self, purpose: int) -> Draws:
+        """Return the random numbers for one purpose in the coming step."""
+        return GeneratorDraws.seeded(self._seed(purpose), self.device)
 
     def _seed(self, purpose: int) -> int:
         """Return the seed for one purpose in the coming step."""
@@ -182,7 +183,7 @@ class Trainer:
         There are no samples outside, so they would not show a part of the shape that every pose moves out of the cube, such as
         one beyond the nose of an animal. A point inside a cube, where its label is unknown, is moved beyond all cells.
         """
-        points = self.model.far_points(self.config.far_points, batch.bone_transforms, self._generator(4), weights)
+        points = self.model.far_points(self.config.far_points, batch.bone_transforms, self._draws(4), weights)
         if points is None:
             return batch
         lower, upper = batch.cube[:, None, 0], batch.cube[:, None, 1]
@@ -203,7 +204,7 @@ class Trainer:
         losses, config = {}, self.config
         transforms, pose = batch.bone_transforms, batch.pose
         if config.bone_occupancy_weight > 0:
-            points = points_on_bones(self.bones, config.bone_points, self._generator(1))
+            points = points_on_bones(self.bones, config.bone_points, self._draws(1))
             owner = self.bone_owners.repeat_interleave(config.bone_points)
             logits = self.model.bone_logits(points, owner, transforms, pose, config.precision, found)
             entropy = F.binary_cross_entropy_with_logits(logits, torch.ones_like(logits))
@@ -216,9 +217,9 @@ class Trainer:
 
     def _agreement_loss(self, batch: Batch, found: Found) -> dict[str, Tensor]:
         """Return the loss that keeps the shape in poses that no frame shows."""
-        generator, config = self._generator(6), self.config
-        made_up = self.made_up.draw(_MADE_UP_POSES, generator)
-        loss = self.model.agreement_loss(batch.pose, made_up, config.agreement_points, generator, config.precision, found)
+        draws, config = self._draws(6), self.config
+        made_up = self.made_up.draw(_MADE_UP_POSES, draws)
+        loss = self.model.agreement_loss(batch.pose, made_up, config.agreement_points, draws, config.precision, found)
         return {} if loss is None else {"agreement": config.agreement_weight * loss}
 
     def averaged_avatar(self) -> TrainedField:

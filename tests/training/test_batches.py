@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from toy_training import new_avatar, toy_store, training_config
 
+from snarfcli.draws import GeneratorDraws
 from snarfcli.training.trainer import Trainer
 
 
@@ -39,7 +40,7 @@ def test_far_points_are_outside_the_cubes(tmp_path):
 
 def test_random_canonical_points_fill_the_active_cells(tmp_path):
     deformer = new_avatar(toy_store(tmp_path)).model.deformer
-    points = deformer.random_canonical(4000, torch.Generator().manual_seed(0))
+    points = deformer.random_canonical(4000, GeneratorDraws.seeded(0))
     assert deformer.is_active(points).all()
     spread = (points.amax(0) - points.amin(0)) / (deformer.upper - deformer.lower)
     assert (spread > 0.5).all()

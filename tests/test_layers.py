@@ -27,6 +27,7 @@ LAYERS = (
     (
         "array_files",
         "checks",
+        "constants",
         "descriptions",
         "draws",
         "formats",

@@ -96,7 +96,8 @@ class PointwiseSystem(System):
 
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
         """Return the box around the posed joints, widened by the largest distance of the body from its bones."""
-        joints = move_with_bones(self._joints, torch.arange(self.num_bones), bone_transforms[None])[0]
+        every = torch.arange(self.num_bones, device=self._joints.device)
+        joints = move_with_bones(self._joints, every, bone_transforms[None])[0]
         return (joints.amin(0) - self.reach).cpu(), (joints.amax(0) + self.reach).cpu()
 
 

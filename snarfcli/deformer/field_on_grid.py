@@ -40,6 +40,8 @@ class FieldOnGrid(nn.Module):
     _used_nodes: Tensor
     _active_nodes: Tensor
     _active_points: Tensor
+    _active_places: Tensor
+    _active_count: Tensor
     _frozen: Tensor | None
     field: Callable[..., Tensor]
     searches_all_cells: bool
@@ -68,6 +70,9 @@ class FieldOnGrid(nn.Module):
         self.register_buffer("_used_nodes", torch.empty(0, dtype=torch.bool), persistent=False)
         self.register_buffer("_active_nodes", torch.empty(0, dtype=torch.long), persistent=False)
         self.register_buffer("_active_points", torch.empty(0, 3), persistent=False)
+        self.register_buffer("_active_places", torch.empty(0, 3, dtype=torch.long), persistent=False)
+        self.register_buffer("_active_count", torch.empty(0, dtype=torch.long), persistent=False)
+        self._keeps_room = False
         self.register_buffer("_frozen", None, persistent=False)
         self.set_active_cells(self.active_cells if active_cells is None else active_cells)
         self.register_load_state_dict_post_hook(_after_load)
@@ -107,9 +112,11 @@ class FieldOnGrid(nn.Module):
     def _one_grid(self, active_only: bool, pose: int | None) -> Tensor:
         if not active_only:
             return self._weights_of_nodes(None, pose).reshape(*self.shape, -1)
-        used = self._active_nodes
-        weights = self._weights_of_nodes(used, pose)
-        return weights.new_zeros(math.prod(self.shape), self.num_bones).index_copy(0, used, weights).reshape(*self.shape, -1)
+        used, count = self._active_nodes, math.prod(self.shape)
+        # With room for more nodes, those that are not used yet go to a row of their own, which is then left out.
+        weights = self._weights_of_nodes(used.clamp_max(count - 1) if self._keeps_room else used, pose)
+        grid = weights.new_zeros(count + self._keeps_room, self.num_bones).index_copy(0, used, weights)
+        return grid[:count].reshape(*self.shape, -1)
 
     def _weights_of_nodes(self, nodes: Tensor | None, pose: int | None) -> Tensor:
         """Return the weights [K, J] at the active nodes, given as `nodes`, or at all nodes if None."""
@@ -270,9 +277,33 @@ class FieldOnGrid(nn.Module):
     def _update_active_nodes(self) -> None:
         """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
         self.searches_all_cells = bool(self.active_cells.all())
-        self._used_nodes = corners_of(self.active_cells)
-        self._active_nodes = self._used_nodes.reshape(-1).nonzero()[:, 0]
-        self._active_points = self.grid.nodes(self.shape).reshape(-1, 3)[self._active_nodes]
+        used = corners_of(self.active_cells)
+        nodes, places = used.reshape(-1).nonzero()[:, 0], self.active_cells.nonzero()
+        points = self.grid.nodes(self.shape).reshape(-1, 3)[nodes]
+        count = torch.full((1,), len(places), device=places.device)
+        if not self._keeps_room:
+            self._used_nodes, self._active_nodes, self._active_points = used, nodes, points
+            self._active_places, self._active_count = places, count
+            return
+        self._used_nodes.copy_(used)
+        self._active_count.copy_(count)
+        self._active_nodes = _fill(self._active_nodes, nodes, math.prod(self.shape))
+        self._active_places = _fill(self._active_places, places, 0)
+        kept = self._active_points
+        if isinstance(self.field, NetworkWeights) and self.field.prior is not None:
+            kept = kept[:0]  # the logits of the prior are kept for this tensor of points
+        self._active_points = _fill(kept, points, 0, len(self._active_nodes))
+
+    def keep_room(self) -> None:
+        """Keep the tensors that follow from the active cells in their places, with room for a quarter more.
+
+        So a captured step stays valid when cells change. Tensors that outgrow their room are replaced by longer ones.
+        """
+        if not self._keeps_room:
+            self._keeps_room = True
+            self._active_nodes, self._active_places = self._active_nodes[:0], self._active_places[:0]
+            self._active_points = self._active_points[:0]
+            self._update_active_nodes()
 
     def is_active(self, canonical: Tensor) -> Tensor:
         """Return whether canonical points [N, 3] lie in cells that a complete search looks into, [N], bool."""
@@ -281,10 +312,22 @@ class FieldOnGrid(nn.Module):
 
     def random_canonical(self, count: int, draws: Draws) -> Tensor:
         """Return canonical points [count, 3] spread evenly over the active cells, metres."""
-        cells = self.active_cells.nonzero()
-        chosen = draws.integers(len(cells), count)
+        chosen = draws.integers(self._active_count if self._keeps_room else len(self._active_places), count)
         places = draws.uniform(count, 3).to(self.lower)
-        return self.lower + (cells[chosen].flip(1) + places) * self.grid.cell_size(self.shape)
+        return self.lower + (self._active_places[chosen].flip(1) + places) * self.grid.cell_size(self.shape)
+
+
+def _fill(kept: Tensor, values: Tensor, empty: int, length: int | None = None) -> Tensor:
+    """Return `kept` with values [K, ...] as its first rows and `empty` in the others; a longer tensor if it is too short.
+
+    Args:
+        length: of the longer tensor; None for a quarter more than K.
+    """
+    if len(kept) < len(values):
+        kept = values.new_empty(length or len(values) + len(values) // 4, *values.shape[1:])
+    kept[: len(values)] = values
+    kept[len(values) :] = empty
+    return kept
 
 
 def _after_load(module: FieldOnGrid, incompatible: object) -> None:

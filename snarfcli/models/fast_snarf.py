@@ -46,6 +46,10 @@ class FoundRoots(Found):
     weights: NodeWeights | None
     """Skinning weights at the grid nodes; None for a field that was searched directly."""
 
+    @property
+    def total(self) -> Tensor:
+        return self.roots.total
+
 
 class FastSnarf(System):
     """Posed occupancy by correspondence search and a canonical occupancy network.
@@ -116,9 +120,17 @@ class FastSnarf(System):
     def node_weights(self) -> NodeWeights | None:
         return self.deformer.node_weights()
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> FoundRoots:
+    def find(
+        self,
+        points: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        weights: NodeWeights | None = None,
+        capacity: int | None = None,
+    ) -> FoundRoots:
         weights = self.node_weights() if weights is None else weights
-        return FoundRoots(self.deformer(points, bone_transforms, weights=weights), weights)
+        roots = self.deformer(points, bone_transforms, capacity, weights)
+        return FoundRoots(roots if capacity is None else roots.unreported(), weights)
 
     def shape_at(self, found: FoundRoots, pose: Tensor, precision: str = "highest") -> FieldSamples:
         """Evaluate the shape network at the roots; a point gets their blend in training, and their maximum otherwise.
@@ -260,6 +272,13 @@ class FastSnarf(System):
         return dropped
 
     # ---------------------------------------------------------------- training
+    @property
+    def has_fixed_shapes(self) -> bool:
+        return not self.deformer.searches_field
+
+    def keep_room(self) -> None:
+        self.deformer.keep_room()
+
     def bone_logits(
         self,
         points: Tensor,
@@ -298,6 +317,7 @@ class FastSnarf(System):
         draws: Draws,
         precision: str = "highest",
         found: FoundRoots | None = None,
+        masks: bool = False,
     ) -> Tensor | None:
         """Return the cross-entropy at random canonical points in made-up poses, with labels from the training poses.
 
@@ -311,10 +331,18 @@ class FastSnarf(System):
         with torch.no_grad():
             known = torch.stack([self._logits_in(one, canonical, weights, precision) for one in self.condition(pose)])
             inside = known.amin(0) > _SURE_LOGIT
-            sure = (inside | (known.amax(0) < -_SURE_LOGIT)).nonzero()[:, 0]
+            is_sure = inside | (known.amax(0) < -_SURE_LOGIT)
+        condition = self.condition(made_up)
+        if masks:
+            # the n-th of the sure points has the n-th pose, as below
+            index = draws.integers(len(made_up), count)[(is_sure.cumsum(0) - 1).clamp_min(0)]
+            logits = self.canonical_logits(canonical, condition, index, precision, weights)
+            entropy = F.binary_cross_entropy_with_logits(logits, inside.to(logits), reduction="none")
+            return torch.where(is_sure, entropy, 0.0).sum() / count
+        sure = is_sure.nonzero()[:, 0]
         index = draws.integers(len(made_up), len(sure))
         seen = None if weights is None else weights[sure]
-        logits = self.canonical_logits(canonical[sure], self.condition(made_up), index, precision, seen)
+        logits = self.canonical_logits(canonical[sure], condition, index, precision, seen)
         return F.binary_cross_entropy_with_logits(logits, inside[sure].to(logits), reduction="sum") / count
 
     def _logits_in(self, condition: Tensor, canonical: Tensor, weights: Tensor | None, precision: str) -> Tensor:

@@ -90,7 +90,14 @@ class Nasa(PointwiseSystem):
     def _make_shape(self, bones: Tensor, box: tuple[Tensor, Tensor]) -> PartNetworks:
         return PartNetworks(self.config.model, self.num_bones)
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
+    def find(
+        self,
+        points: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        weights: NodeWeights | None = None,
+        capacity: int | None = None,
+    ) -> Found:
         return self._bone_frames(points, bone_transforms)
 
     def shape_at(self, found: BoneFrames, pose: Tensor, precision: str = "highest") -> FieldSamples:

@@ -75,7 +75,14 @@ class PointwiseSystem(System):
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         """Build the parts of the system besides its shape; the arguments are those of the constructor."""
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
+    def find(
+        self,
+        points: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        weights: NodeWeights | None = None,
+        capacity: int | None = None,
+    ) -> Found:
         with matmul_precision("highest"), torch.autocast(points.device.type, enabled=False):
             return FoundPoints(*self.canonical_points(points, bone_transforms, pose))
 

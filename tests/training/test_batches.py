@@ -20,7 +20,7 @@ def test_far_points_are_outside_the_cubes(tmp_path):
     tight = replace(batch, cube=torch.stack([batch.cube[:, 0] + 0.3 * half, batch.cube[:, 1] - 0.3 * half], 1))
     count = batch.points.shape[1]
     for given in (batch, tight):
-        more = trainer._with_far_points(given, trainer.model.node_weights())
+        more = trainer.objective.with_far_points(given, trainer.model.node_weights(), trainer._draws)
         assert torch.equal(more.points[:, :count], batch.points)
         assert torch.equal(more.occupied[:, :count], batch.occupied)
         far = more.points[:, count:]
@@ -34,7 +34,7 @@ def test_far_points_are_outside_the_cubes(tmp_path):
     assert 0.05 < reached.float().mean() < 0.95
     assert (far[~reached].norm(dim=1) > 5).all()
     assert (far[reached].norm(dim=1) < 3).all()
-    again = trainer._with_far_points(tight, trainer.model.node_weights())
+    again = trainer.objective.with_far_points(tight, trainer.model.node_weights(), trainer._draws)
     assert torch.equal(again.points, more.points)  # a resumed run draws the same
 
 

@@ -34,7 +34,7 @@ class Batch:
     pose: Tensor
     """[B, J, 3] axis-angle, radians."""
     frames: list[Frame]
-    """B pairs of a sequence and the index of a frame."""
+    """B pairs of a sequence and the index of a frame; empty if they were drawn on the device."""
     cube: Tensor
     """[B, 2, 3], lower and upper corner of the cube that holds the points of a frame, metres; outside, nothing is occupied."""
 

@@ -17,7 +17,7 @@ __all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "check_same_settings", "ch
 CHECKPOINT_FORMAT = "snarf-checkpoint"
 CHECKPOINT_VERSION = 2
 
-_OF_THE_MACHINE = ("workers",)  # settings with which a training may continue on another one
+_OF_THE_MACHINE = ("workers", "graph")  # settings with which a training may continue on another one
 
 
 def check_same_settings(state: dict[str, Any], avatar: AvatarConfig, training: TrainingConfig, seed: int, path: str) -> None:

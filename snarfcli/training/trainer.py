@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from snarfcli.draws import Draws, GeneratorDraws
+from snarfcli.draws import Draws, GeneratorDraws, HashedDraws
 from snarfcli.errors import UserError, is_out_of_memory
 from snarfcli.fitting import PoseRefiner, require_refinable
 from snarfcli.models.fast_snarf import FastSnarf
@@ -20,7 +20,7 @@ from snarfcli.models.trained_field import TrainedField
 from snarfcli.precision import PRECISIONS
 from snarfcli.samples.store import SampleStore
 from snarfcli.texts import one_line
-from snarfcli.training.batches import Batch, new_batches
+from snarfcli.training.batches import Batch
 from snarfcli.training.checkpoints import (
     CHECKPOINT_FORMAT,
     CHECKPOINT_VERSION,
@@ -28,7 +28,10 @@ from snarfcli.training.checkpoints import (
     checked_seconds,
     checked_step,
 )
+from snarfcli.training.device_batches import DeviceBatches
+from snarfcli.training.device_steps import DeviceSteps, choose_batches
 from snarfcli.training.finishing import averaged, drop_needless, validate
+from snarfcli.training.graphs import CaptureFailed
 from snarfcli.training.numbers import StepNumbers
 from snarfcli.training.objective import Objective
 from snarfcli.training.optimizer import AveragedAdam
@@ -41,6 +44,7 @@ log = logging.getLogger(__name__)
 
 _REFINE_FROM = 100  # step; before, the shape may lack whole limbs
 _RENEW_POINTS_EVERY = 100  # steps between two updates of the surface that refined poses are matched with
+_SETTLE_EVERY = 50  # steps between two looks at what has become of those that run ahead of the host
 _POSES_OF_A_REFRESH = 4  # number of training poses from which the searched cells are updated
 _REFRESH, _EXTENSION = 2, 3  # purposes of random numbers; others are in objective.py and batches.py
 
@@ -63,7 +67,7 @@ class Trainer:
         device: on which to compute.
 
     Raises:
-        ValueError: `config.precision` or `config.joint_target` is unknown.
+        ValueError: `config.precision`, `config.joint_target` or `config.graph` is unknown.
     """
 
     def __init__(
@@ -76,21 +80,60 @@ class Trainer:
         self.avatar, self.store, self.config, self.seed, self.device = avatar, store, config, seed, device
         self.model = avatar.model.to(device)
         self.model.train()
-        self.batches = new_batches(store, config, seed, device)
+        self.batches = choose_batches(store, config, seed, device, self.model)
         self.refiner = self._new_refiner() if config.refine_poses else None
         self.objective = Objective(avatar, config, self.batches.poses())
         self.optimizer = AveragedAdam(self.model, config)
+        self._ahead: DeviceSteps | None = None  # steps that run ahead of the host
+        if isinstance(self.batches, DeviceBatches):
+            self._ahead = DeviceSteps(self.objective, self.batches, self.optimizer)
         self.step = 0
+        """The coming step. Where steps run ahead of the host it may fall back in `settle`, as steps are taken again."""
         self.seconds = 0.0
         """Time that the steps have taken, in all parts of the run."""
 
     def advance(self) -> StepNumbers:
-        """Take one step and return its losses and counts, which are read from the device when they are asked for.
+        """Take one step, or start it on a device, and return its losses and counts, which are read when they are asked for.
 
         Raises:
-            Diverged: the loss, or its gradient, is not finite; the step is not taken.
+            Diverged: the loss, or its gradient, is not finite; the step is not taken. Where steps run ahead of the host it is
+                raised at most 50 steps later.
         """
         self._maintain_grids()
+        if self._ahead is None or not self._ahead.is_ready:
+            return self._eager_step()
+        try:
+            numbers = self._ahead.run(self.step, kind_of(self.config, self.step))
+        except CaptureFailed as error:
+            log.info("steps are not captured in a CUDA graph from here on: %s", error)
+            self.settle()
+            self._ahead = None
+            return self._eager_step()
+        self.step += 1
+        if self.step % _SETTLE_EVERY == 0 or self.step >= self.config.steps:
+            self.settle()
+        return numbers
+
+    def settle(self) -> None:
+        """Wait for all steps that were started, and set `step` to the number of those that were taken.
+
+        A step with more roots than there was room for is taken eagerly.
+
+        Raises:
+            Diverged: a loss or gradient was not finite.
+        """
+        progress = None if self._ahead is None else self._ahead.progress()
+        if progress is None:
+            return
+        self.step = progress.step
+        if progress.is_cut:
+            self._eager_step()
+        elif progress.is_halted:
+            self._check_finite("loss", progress.loss)
+            self._check_finite("gradient", math.nan)
+
+    def _eager_step(self) -> StepNumbers:
+        """Take one step whose loss is read before the gradient is computed: the readable form of a static step."""
         batch = self.batches.batch(self.step)
         if self.refiner is not None and self.step >= _REFINE_FROM:
             batch = self._with_refined_poses(batch)
@@ -100,6 +143,8 @@ class Trainer:
         self.objective.add_gradients(evaluated)
         self._check_finite("gradient", self.optimizer.step(self.learning_rate(), self.step))
         self.step += 1
+        if self._ahead is not None:
+            self._ahead.note_eager_step(0 if evaluated.roots is None else int(evaluated.roots))
         return StepNumbers.of(evaluated.numbers())
 
     def learning_rate(self) -> float:
@@ -126,6 +171,13 @@ class Trainer:
 
     def _maintain_grids(self) -> None:
         """Let the grids follow the shape, in the steps in which this is due."""
+        periods = (self.config.extend_weights_every, self.config.refresh_cells_every)
+        if not any(is_due(self.step, every) for every in periods):
+            return
+        before = self.step
+        self.settle()
+        if self.step != before:
+            return  # it is due later
         poses = partial(self.batches.poses, _POSES_OF_A_REFRESH)
         if is_due(self.step, self.config.extend_weights_every):
             random = np.random.default_rng([self.seed, self.step, _EXTENSION])
@@ -136,6 +188,8 @@ class Trainer:
             random = np.random.default_rng([self.seed, self.step, _REFRESH])
             self.model.refresh_cells(poses(random), self.config.precision)
             self.optimizer.follow_growth()
+        if self._ahead is not None:
+            self._ahead.follow()
 
     def _check_finite(self, what: str, value: float) -> None:
         """Raise Diverged for a step that would spoil the weights, and that is not taken."""
@@ -147,6 +201,8 @@ class Trainer:
 
     def _draws(self, purpose: int) -> Draws:
         """Return the random numbers for one purpose in the coming step."""
+        if isinstance(self.batches, DeviceBatches):
+            return HashedDraws(self.seed, torch.tensor(self.step, device=self.device), purpose)
         seed = int(np.random.default_rng([self.seed, self.step, purpose]).integers(2**62))
         return GeneratorDraws.seeded(seed, self.device)
 
@@ -165,7 +221,12 @@ class Trainer:
         return validate(self.averaged_avatar(), self.store, self.config.validation_frames, self.refiner)
 
     def state(self) -> dict[str, Any]:
-        """Return all state on which the coming steps depend, as plain dicts and tensors."""
+        """Return all state on which the coming steps depend, as plain dicts and tensors; waits for steps that were started.
+
+        Raises:
+            Diverged: as `settle`.
+        """
+        self.settle()
         return {
             "format": CHECKPOINT_FORMAT,
             "version": CHECKPOINT_VERSION,
@@ -192,6 +253,8 @@ class Trainer:
                 self.refiner.restore(state["poses"])
             torch.set_rng_state(read_tensor(state["random"], "random", torch.get_rng_state().shape, torch.uint8))
             self.step = checked_step(state["step"], self.config.steps)
+            if self._ahead is not None:
+                self._ahead.follow()
             self.seconds = checked_seconds(state.get("seconds", 0.0))
         except (LookupError, RuntimeError, TypeError, ValueError, AttributeError) as error:
             if is_out_of_memory(error):

@@ -8,6 +8,9 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 
+from snarfcli.native import cuda_draws
+from snarfcli.native.backend import choose_backend
+
 __all__ = ["Draws", "GeneratorDraws", "HashedDraws", "random_bits"]
 
 _BITS = 2**32
@@ -122,13 +125,24 @@ def random_bits(step: Tensor, key: int, count: int) -> Tensor:
 
     Source: the form of the hash (shift, xor, multiply) is that of the finalizer of MurmurHash3 (Appleby, 2011).
     """
-    of_step = _mixed_tensor(step.reshape(1) ^ key)
-    return _mixed_tensor(torch.arange(count, device=step.device) ^ of_step)
+    return _random_bits_reference(step, key, count)
+
+
+@random_bits.register_kernel("cuda")
+def _(step, key, count):
+    if choose_backend("auto", "cuda") == "native":
+        return cuda_draws.random_bits(step, key, count)
+    return _random_bits_reference(step, key, count)
 
 
 @random_bits.register_fake
 def _(step, key, count):
     return step.new_empty(count)
+
+
+def _random_bits_reference(step: Tensor, key: int, count: int) -> Tensor:
+    of_step = _mixed_tensor(step.reshape(1) ^ key)
+    return _mixed_tensor(torch.arange(count, device=step.device) ^ of_step)
 
 
 def _mixed_tensor(bits: Tensor) -> Tensor:

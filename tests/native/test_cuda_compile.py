@@ -11,7 +11,7 @@ import torch
 from snarfcli.native import cuda, cuda_compile
 from snarfcli.native.kernel_cache import read_cached
 
-SOURCES = ("broyden", "complete", "gather", "implicit", "optimizer")
+SOURCES = ("broyden", "complete", "draws", "gather", "implicit", "optimizer")
 
 
 def nvrtc_problem() -> str | None:

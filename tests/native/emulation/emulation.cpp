@@ -3,6 +3,7 @@
 
 #include "broyden.cu"
 #include "complete.cu"
+#include "draws.cu"
 #include "gather.cu"
 #include "implicit.cu"
 #include "optimizer.cu"
@@ -39,6 +40,7 @@ const Entry<const Search<Number>> search_kernels[] = {
     {"write_roots", write_roots},
 };
 const Entry<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
+const Entry<const DrawTask> draw_kernels[] = {{"draw_bits", draw_bits}};
 const Entry<const AdamLaunch> optimizer_kernels[] = {
     {"check_gradients", check_gradients},
     {"update_parameters", update_parameters},
@@ -50,6 +52,7 @@ const Entry<const AdamLaunch> optimizer_kernels[] = {
 extern "C" bool emulate(const char* name, const void* arguments, unsigned x, unsigned y, unsigned threads) {
   return run_named(search_kernels, name, arguments, x, y, threads) ||
          run_named(backward_kernels, name, arguments, x, y, threads) ||
+         run_named(draw_kernels, name, arguments, x, y, threads) ||
          run_named(optimizer_kernels, name, arguments, x, y, threads);
 }
 extern "C" size_t search_bytes() { return sizeof(Search<Number>); }

@@ -77,8 +77,8 @@ class DeviceSteps:
         Raises:
             CaptureFailed: it could not be captured, and was not started.
         """
-        self._graphs.follow()
-        if self._next != step:
+        if self._next != step:  # something has happened since the last step
+            self._graphs.follow()
             self._static.begin(step)
         numbers = self._graphs.run(kind)
         self._next = step + 1

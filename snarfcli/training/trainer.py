@@ -57,7 +57,11 @@ class Trainer:
     """Train an avatar's networks on the samples of one subject.
 
     All randomness comes from the seed, the number of the step and PyTorch's generator, whose state is part of a checkpoint: a
-    resumed run takes the same steps as an uninterrupted one.
+    resumed run takes the same steps as an uninterrupted one. On a GPU, atomic additions in varying order, and the eager steps
+    with which a resumed run counts roots, make a difference in rounding.
+
+    On a CUDA device, or with `config.graph` "on", steps are static ones (see `StaticStep`) that run ahead of the host. The
+    eager step is their readable form, the only one elsewhere, and takes over where a capture fails.
 
     Args:
         avatar: the avatar to train, on `device`.
@@ -111,26 +115,29 @@ class Trainer:
             return self._eager_step()
         self.step += 1
         if self.step % _SETTLE_EVERY == 0 or self.step >= self.config.steps:
-            self.settle()
+            numbers = self.settle() or numbers
         return numbers
 
-    def settle(self) -> None:
+    def settle(self) -> StepNumbers | None:
         """Wait for all steps that were started, and set `step` to the number of those that were taken.
 
-        A step with more roots than there was room for is taken eagerly.
+        Returns:
+            The numbers of a step that had more roots than there was room for, and that was now taken eagerly; None if all steps
+            were taken.
 
         Raises:
             Diverged: a loss or gradient was not finite.
         """
         progress = None if self._ahead is None else self._ahead.progress()
         if progress is None:
-            return
+            return None
         self.step = progress.step
         if progress.is_cut:
-            self._eager_step()
-        elif progress.is_halted:
+            return self._eager_step()
+        if progress.is_halted:
             self._check_finite("loss", progress.loss)
             self._check_finite("gradient", math.nan)
+        return None
 
     def _eager_step(self) -> StepNumbers:
         """Take one step whose loss is read before the gradient is computed: the readable form of a static step."""

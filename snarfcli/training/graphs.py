@@ -50,7 +50,8 @@ class StepGraphs:
         self._side: torch.cuda.Stream | None = None
 
     def drop(self) -> None:
-        """Forget all graphs: what they read may be elsewhere."""
+        """Forget all graphs, and the gradients that belong to them: what they read may be elsewhere."""
+        self._forget_gradients()
         self._graphs.clear()
         self._warm.clear()
         self._known = []
@@ -71,10 +72,14 @@ class StepGraphs:
         if not self._is_cuda:
             return self._step.run(kind)
         if kind not in self._graphs:
-            if self._warm.get(kind, 0) < _WARM_UP_STEPS:
-                self._warm[kind] = self._warm.get(kind, 0) + 1
-                return self._run_aside(kind)
-            self._graphs[kind] = self._capture(kind)
+            try:
+                if self._warm.get(kind, 0) < _WARM_UP_STEPS:
+                    self._warm[kind] = self._warm.get(kind, 0) + 1
+                    return self._run_aside(kind)
+                self._graphs[kind] = self._capture(kind)
+            except RuntimeError as error:
+                self.drop()
+                raise CaptureFailed(_reason(error)) from error
         graph, numbers = self._graphs[kind]
         graph.replay()
         return StepNumbers(numbers.names, numbers.values_on_device.clone())  # the next replay overwrites them
@@ -96,15 +101,14 @@ class StepGraphs:
         graph = torch.cuda.CUDAGraph()
         pool = next(iter(self._graphs.values()))[0].pool() if self._graphs else None
         self._forget_gradients()
-        try:
-            with torch.cuda.device(self._step.device), torch.cuda.graph(graph, pool=pool):
-                numbers = self._step.run(kind)
-        except RuntimeError as error:  # torch.OutOfMemoryError is one
-            self.drop()
-            torch.cuda.empty_cache()
-            what = "there is not enough memory on the GPU" if is_out_of_memory(error) else one_line(error, 200)
-            raise CaptureFailed(what) from error
-        finally:
-            self._forget_gradients()
+        with torch.cuda.device(self._step.device), torch.cuda.graph(graph, pool=pool):
+            numbers = self._step.run(kind)
+        self._forget_gradients()
         log.debug("captured a step: %s", kind)
         return graph, numbers
+
+
+def _reason(error: RuntimeError) -> str:
+    """Return why a step failed, in one line; after running out of memory the end of a capture may fail as well."""
+    causes = (error, error.__context__ or error)
+    return "there is not enough memory on the GPU" if any(map(is_out_of_memory, causes)) else one_line(error, 200)

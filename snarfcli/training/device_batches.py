@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -29,6 +31,8 @@ class DeviceBatches(FrameBatches):
     Raises:
         torch.OutOfMemoryError: the device has no room for the samples.
     """
+
+    are_static: ClassVar[bool] = True
 
     def __init__(self, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> None:
         super().__init__(store, config, seed, device)

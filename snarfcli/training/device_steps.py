@@ -18,6 +18,7 @@ from snarfcli.training.objective import Objective
 from snarfcli.training.optimizer import AveragedAdam
 from snarfcli.training.schedule import StepKind
 from snarfcli.training.settings import TrainingConfig
+from snarfcli.training.staged_batches import StagedBatches
 from snarfcli.training.static_step import Progress, StaticStep
 
 __all__ = ["GRAPHS", "DeviceSteps", "choose_batches"]
@@ -38,12 +39,12 @@ class DeviceSteps:
 
     Args:
         objective: the loss.
-        batches: on the device.
+        batches: those that static steps can read.
         optimizer: of the parameters.
     """
 
-    def __init__(self, objective: Objective, batches: DeviceBatches, optimizer: AveragedAdam) -> None:
-        self._model, self._optimizer = objective.model, optimizer
+    def __init__(self, objective: Objective, batches: FrameBatches, optimizer: AveragedAdam) -> None:
+        self._model, self._optimizer, self._batches = objective.model, optimizer, batches
         self._static = StaticStep(objective, batches, optimizer)
         self._graphs = StepGraphs(self._static, self._tensors, optimizer.zero_gradients)
         self._next: int | None = None  # step that the device takes next, as far as the host knows; None if it must be told
@@ -80,6 +81,7 @@ class DeviceSteps:
         if self._next != step:  # something has happened since the last step
             self._graphs.follow()
             self._static.begin(step)
+        self._batches.stage(step)
         numbers = self._graphs.run(kind)
         self._next = step + 1
         return numbers
@@ -104,7 +106,7 @@ class DeviceSteps:
 
 
 def choose_batches(store: SampleStore, config: TrainingConfig, seed: int, device: torch.device, model: System) -> FrameBatches:
-    """Return batches on the device if the steps of a training can have fixed shapes and should, otherwise those of the host.
+    """Return batches for static steps if the steps of a training can have fixed shapes and should, otherwise ordinary ones.
 
     One line of the log says why steps are not captured that were to be.
 
@@ -120,7 +122,7 @@ def choose_batches(store: SampleStore, config: TrainingConfig, seed: int, device
             log.info("the training step is not captured in a CUDA graph: %s", why_not)
         return new_batches(store, config, seed, device)
     try:
-        batches = DeviceBatches(store, config, seed, device)
+        batches = (StagedBatches if config.fresh_points else DeviceBatches)(store, config, seed, device)
     except (RuntimeError, MemoryError) as error:
         if not is_out_of_memory(error):
             raise
@@ -133,8 +135,6 @@ def choose_batches(store: SampleStore, config: TrainingConfig, seed: int, device
 
 def _why_no_fixed_shapes(config: TrainingConfig, model: System) -> str | None:
     """Return why the steps of a training cannot have fixed shapes on the device, or None if they can."""
-    if config.fresh_points:
-        return "training.fresh_points=true makes its points on the processor"
     if config.refine_poses:
         return "training.refine_poses=true changes the samples in every step"
     if not model.has_fixed_shapes:

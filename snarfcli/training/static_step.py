@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from snarfcli.draws import HashedDraws
-from snarfcli.training.device_batches import DeviceBatches
+from snarfcli.training.batches import FrameBatches
 from snarfcli.training.numbers import StepNumbers
 from snarfcli.training.objective import Objective
 from snarfcli.training.optimizer import AveragedAdam
@@ -44,11 +44,11 @@ class StaticStep:
 
     Args:
         objective: the loss.
-        batches: on the device.
+        batches: those that static steps can read.
         optimizer: of the parameters.
     """
 
-    def __init__(self, objective: Objective, batches: DeviceBatches, optimizer: AveragedAdam) -> None:
+    def __init__(self, objective: Objective, batches: FrameBatches, optimizer: AveragedAdam) -> None:
         self._objective, self._batches, self._optimizer = objective, batches, optimizer
         self.device, config = batches.device, batches.config
         rates = [learning_rate(config, step) for step in range(config.steps + 1)]
@@ -68,7 +68,7 @@ class StaticStep:
             state.zero_()
 
     def run(self, kind: StepKind) -> StepNumbers:
-        """Take the coming step, which must be of this kind, or leave it and all further ones out.
+        """Take the coming step, which must be of this kind and staged, or leave it and all further ones out.
 
         Nothing waits for the device, and nothing is copied to or from it.
         """

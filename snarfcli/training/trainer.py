@@ -28,7 +28,6 @@ from snarfcli.training.checkpoints import (
     checked_seconds,
     checked_step,
 )
-from snarfcli.training.device_batches import DeviceBatches
 from snarfcli.training.device_steps import DeviceSteps, choose_batches
 from snarfcli.training.finishing import averaged, drop_needless, validate
 from snarfcli.training.graphs import CaptureFailed
@@ -89,7 +88,7 @@ class Trainer:
         self.objective = Objective(avatar, config, self.batches.poses())
         self.optimizer = AveragedAdam(self.model, config)
         self._ahead: DeviceSteps | None = None  # steps that run ahead of the host
-        if isinstance(self.batches, DeviceBatches):
+        if self.batches.are_static:
             self._ahead = DeviceSteps(self.objective, self.batches, self.optimizer)
         self.step = 0
         """The coming step. Where steps run ahead of the host it may fall back in `settle`, as steps are taken again."""
@@ -208,7 +207,7 @@ class Trainer:
 
     def _draws(self, purpose: int) -> Draws:
         """Return the random numbers for one purpose in the coming step."""
-        if isinstance(self.batches, DeviceBatches):
+        if self.batches.are_static:
             return HashedDraws(self.seed, torch.tensor(self.step, device=self.device), purpose)
         seed = int(np.random.default_rng([self.seed, self.step, purpose]).integers(2**62))
         return GeneratorDraws.seeded(seed, self.device)

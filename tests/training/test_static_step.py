@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -80,7 +81,7 @@ def eager(trainer: Trainer) -> Trainer:
     return trainer
 
 
-def largest_difference(some: list[torch.Tensor], others: list[torch.Tensor], least: float) -> float:
+def largest_difference(some: Sequence[torch.Tensor], others: Sequence[torch.Tensor], least: float) -> float:
     """Return the largest difference of tensors, each as a share of the largest number in it, or of `least`."""
     pairs = [(mine.detach(), theirs.detach()) for mine, theirs in zip(some, others, strict=True) if mine.numel()]
     return max(float((mine - theirs).abs().max()) / max(float(theirs.abs().max()), least) for mine, theirs in pairs)
@@ -136,6 +137,14 @@ def test_a_run_follows_the_eager_run(store, architecture):
     assert one._ahead._static.progress().step == 30
     assert largest_difference(one.optimizer.average, other.optimizer.average, 1e-3) <= 1e-2
     assert torch.equal(one.model.deformer.active_cells, other.model.deformer.active_cells)
+
+
+def test_fresh_points_are_staged_for_static_steps(store):
+    one, other = (trainer_for(store, fresh_points=True, workers=0) for _ in range(2))
+    losses, wanted = advance_to(one, 12), advance_to(eager(other), 12)
+    assert losses == pytest.approx(wanted, rel=1e-5)
+    assert one._ahead is not None
+    assert one._ahead._static.progress().step == 12
 
 
 def test_a_step_with_too_many_roots_changes_nothing_and_is_taken_later(store):
@@ -251,7 +260,6 @@ def test_frames_repeat_only_if_there_are_too_few(store):
 @pytest.mark.parametrize(
     ("changes", "name", "line"),
     [
-        ({"graph": "on", "fresh_points": True}, "fast_snarf", "training.fresh_points=true makes its points on the processor"),
         ({"graph": "on", "refine_poses": True}, "fast_snarf", "training.refine_poses=true changes the samples"),
         ({"graph": "on"}, "snarf", "a search in the weight field itself, as of model=snarf"),
         ({"graph": "on"}, "fast_snarf", "training.graph=on: steps have fixed shapes, and are not captured"),

@@ -81,11 +81,12 @@ RUNS = """
     from dataclasses import replace
 
     import torch
-    from pretend_gpu.device import CUDA
+    from pretend_gpu.device import CUDA, watch
     from toy_training import avatar_config, new_avatar, training_config
 
     from snarfcli.samples.store import SampleStore
     from snarfcli.training import graphs
+    from snarfcli.training.schedule import kind_of
     from snarfcli.training.trainer import Trainer
 
     graphs._WARM_UP_STEPS = 1
@@ -133,6 +134,13 @@ RUNS = """
         def __enter__(self): raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
         def __exit__(self, *exception): ...
 
+    config.fresh_points = True
+    _, eager_fresh = run(graph=False, steps=7)
+    trainer, fresh = run(graph=True, steps=6)
+    with watch("fresh"):
+        trainer._ahead.run(6, kind_of(config, 6))
+    compare(fresh, eager_fresh)
+    config.fresh_points = False
     torch.cuda.graph = Full
     trainer, full = run(graph=True, steps=7)
     compare(full, eager)
@@ -143,9 +151,13 @@ RUNS = """
 def test_captured_steps_are_those_of_the_eager_run(samples):
     """Through refreshed cells, grown grids, extended weights and a capacity that is too small, with all four kinds of steps.
 
-    And if there is no memory for a capture, the run goes on eagerly, with one line.
+    Also with fresh points, which the GPU copies from pinned memory. If there is no memory for a capture, the run goes on
+    eagerly, with one line.
     """
-    lines = run_on_pretend_gpu(RUNS, samples).output.splitlines()
+    report = run_on_pretend_gpu(RUNS, samples)
+    lines = report.output.splitlines()
     captured = {line for line in lines if line.startswith("captured a step: ")}
     assert len(captured) == 4
+    assert (report["fresh"].mixing, report["fresh"].copies) == ([], [])
+    assert all("Event.synchronize" in wait for wait in report["fresh"].waits)  # for the copy of three steps before
     assert lines.count("steps are not captured in a CUDA graph from here on: there is not enough memory on the GPU") == 1

@@ -11,7 +11,7 @@ import torch
 from snarfcli.native import cuda, cuda_compile
 from snarfcli.native.kernel_cache import read_cached
 
-SOURCES = ("broyden", "candidates", "complete", "gather", "implicit", "optimizer", "parts")
+SOURCES = ("broyden", "candidates", "complete", "draws", "gather", "implicit", "optimizer", "parts")
 
 
 def nvrtc_problem() -> str | None:

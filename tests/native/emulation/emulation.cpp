@@ -4,6 +4,7 @@
 #include "broyden.cu"
 #include "candidates.cu"
 #include "complete.cu"
+#include "draws.cu"
 #include "gather.cu"
 #include "implicit.cu"
 #include "optimizer.cu"
@@ -45,6 +46,7 @@ const Entry<const Search<Number>> search_kernels[] = {
     {"write_roots", write_roots},
 };
 const Entry<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
+const Entry<const DrawTask> draw_kernels[] = {{"draw_bits", draw_bits}};
 const Entry<const AdamLaunch> optimizer_kernels[] = {
     {"check_gradients", check_gradients},
     {"update_parameters", update_parameters},
@@ -56,6 +58,7 @@ const Entry<const AdamLaunch> optimizer_kernels[] = {
 extern "C" bool emulate(const char* name, const void* arguments, unsigned x, unsigned y, unsigned threads) {
   return run_named(search_kernels, name, arguments, x, y, threads) ||
          run_named(backward_kernels, name, arguments, x, y, threads) ||
+         run_named(draw_kernels, name, arguments, x, y, threads) ||
          run_named(optimizer_kernels, name, arguments, x, y, threads);
 }
 // What the blocks of the last launch did, [blocks, 2, 3]: sum over the threads and the most of one; rounds, halvings, solves.

@@ -23,10 +23,11 @@ LAYERS = (
     ("datasets", "meshing"),
     ("models", "motions"),
     ("deformer", "shape"),
-    ("bodies", "networks"),
+    ("bodies", "draws", "networks"),
     (
         "array_files",
         "checks",
+        "constants",
         "descriptions",
         "formats",
         "hydra_config",

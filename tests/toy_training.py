@@ -41,7 +41,7 @@ def training_config(**changes: object) -> TrainingConfig:
     """Return settings of a short training."""
     config = TrainingConfig(
         name="toy", steps=150, poses_per_step=3, uniform_points=200, surface_points=200, far_points=20, fresh_points=False,
-        workers=0, agreement_weight=0.0, agreement_points=200, agreement_every=2, learning_rate=1e-2,
+        workers=0, graph="auto", agreement_weight=0.0, agreement_points=200, agreement_every=2, learning_rate=1e-2,
         feature_rate=3.0, final_learning_rate=0.05,
         warmup_steps=5, average_decay=0.95, bootstrap_steps=50, bone_occupancy_weight=0.1,
         bone_points=5, joint_weight=1.0, joint_target="halves", refresh_cells_every=40,

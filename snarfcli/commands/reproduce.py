@@ -164,7 +164,8 @@ def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
             GlobalHydra.instance().initialize(running)
     for name in _NOT_OF_THE_AVATAR:
         config.pop(name)
-    config["training"].pop("workers", None)
+    for name in ("workers", "graph"):
+        config["training"].pop(name, None)
     return config
 
 

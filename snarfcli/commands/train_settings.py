@@ -15,6 +15,7 @@ from snarfcli.models.settings import ModelConfig
 from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.precision import PRECISIONS
 from snarfcli.shape import CONDITIONS, ConditionConfig, ShapeConfig
+from snarfcli.training.device_steps import GRAPHS
 from snarfcli.training.losses import JOINT_TARGETS
 from snarfcli.training.settings import TrainingConfig
 
@@ -92,6 +93,7 @@ def check_settings(config: TrainConfig) -> None:
     check_number("training.final_learning_rate", training.final_learning_rate, 0, 1)
     check_number("training.average_decay", training.average_decay, 0, 1)
     check_choice("training.precision", training.precision, PRECISIONS)
+    check_choice("training.graph", training.graph, GRAPHS)
     check_choice("training.joint_target", training.joint_target, JOINT_TARGETS)
     check_choice("shape.name", config.shape.name, ("mlp", "grid"))
     if (config.shape.name == "grid") != bool(config.shape.feature_cells_m):

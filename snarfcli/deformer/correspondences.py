@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -68,6 +69,12 @@ class Correspondences:
     def is_cut(self) -> Tensor:
         """Bool [], whether a capacity cut roots; does not wait for a GPU."""
         return (self.total > self.query.shape[0])[0]
+
+    def unreported(self) -> Correspondences:
+        """Return the same, for which no warning reports a cut: for callers who look at `is_cut` or `total` themselves."""
+        same = copy.copy(self)
+        object.__setattr__(same, "_is_reported", True)
+        return same
 
     def padded(self, values: Tensor | None = None, slots: int | None = None) -> tuple[Tensor, Tensor]:
         """Return what belongs to the roots of each query side by side.

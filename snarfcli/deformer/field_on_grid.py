@@ -8,8 +8,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from snarfcli.deformer.active_cells import ActiveCells
 from snarfcli.deformer.callables import takes_pose, with_pose
-from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
 from snarfcli.deformer.roots import is_costly_to_read
 from snarfcli.deformer.variation import total_variation
@@ -20,7 +20,7 @@ __all__ = ["FieldOnGrid"]
 _VALUES_AT_ONCE = 2**24  # of a layer, at the nodes; 65,536 nodes with layers of 256
 
 
-class FieldOnGrid(nn.Module):
+class FieldOnGrid(ActiveCells):
     """A weight field, evaluated at the nodes of a grid or, if `searches_field`, used as it is.
 
     Args:
@@ -32,17 +32,8 @@ class FieldOnGrid(nn.Module):
         active_cells: [D-1, H-1, W-1], bool, see `set_active_cells`; None for all.
     """
 
-    lower: Tensor
-    upper: Tensor
-    active_cells: Tensor
-    """[D-1, H-1, W-1], bool, the cells that a complete search looks into; see `set_active_cells`."""
-    _used_nodes: Tensor
-    _active_nodes: Tensor
-    _active_points: Tensor
     _frozen: Tensor | None
     field: Callable[..., Tensor]
-    searches_all_cells: bool
-    """Whether all cells are active."""
 
     def __init__(
         self,
@@ -53,33 +44,24 @@ class FieldOnGrid(nn.Module):
         searches_field: bool,
         active_cells: Tensor | None,
     ) -> None:
-        super().__init__()
-        self.shape = shape
+        super().__init__(grid, shape, active_cells)
         self.num_bones = num_bones
         self.searches_field = searches_field
         """Whether roots are those of the field itself and not of its values at the grid nodes."""
         self.field = field
         if isinstance(self.field, GridWeights) and self.field.shape != self.shape:
             raise ValueError(f"field: wanted the grid's nodes {list(self.shape)} (z, y, x), got {list(self.field.shape)}")
-        self.register_buffer("lower", grid.lower.clone())
-        self.register_buffer("upper", grid.upper.clone())
-        self.register_buffer("active_cells", torch.ones([n - 1 for n in self.shape], dtype=torch.bool))
-        self.register_buffer("_used_nodes", torch.empty(0, dtype=torch.bool), persistent=False)
-        self.register_buffer("_active_nodes", torch.empty(0, dtype=torch.long), persistent=False)
-        self.register_buffer("_active_points", torch.empty(0, 3), persistent=False)
         self.register_buffer("_frozen", None, persistent=False)
-        self.set_active_cells(self.active_cells if active_cells is None else active_cells)
         self.register_load_state_dict_post_hook(_after_load)
-
-    @property
-    def grid(self) -> CanonicalGrid:
-        """The box of the weight grid."""
-        return CanonicalGrid(self.lower, self.upper, checked=True)
 
     @property
     def takes_pose(self) -> bool:
         """Whether the field has a parameter `pose_index`, so that the weights differ from pose to pose."""
         return takes_pose(self.field)
+
+    @property
+    def _renews_points(self) -> bool:
+        return isinstance(self.field, NetworkWeights) and self.field.prior is not None  # whose logits are kept for the tensor
 
     # ---------------------------------------------------------------- weights at the nodes
     def weight_grid(self, active_only: bool = False, poses: int | None = None) -> Tensor:
@@ -106,9 +88,11 @@ class FieldOnGrid(nn.Module):
     def _one_grid(self, active_only: bool, pose: int | None) -> Tensor:
         if not active_only:
             return self._weights_of_nodes(None, pose).reshape(*self.shape, -1)
-        used = self._active_nodes
-        weights = self._weights_of_nodes(used, pose)
-        return weights.new_zeros(math.prod(self.shape), self.num_bones).index_copy(0, used, weights).reshape(*self.shape, -1)
+        used, count = self._active_nodes, math.prod(self.shape)
+        # With room for more nodes, those that are not used yet go to a row of their own, which is then left out.
+        weights = self._weights_of_nodes(used.clamp_max(count - 1) if self._keeps_room else used, pose)
+        grid = weights.new_zeros(count + self._keeps_room, self.num_bones).index_copy(0, used, weights)
+        return grid[:count].reshape(*self.shape, -1)
 
     def _weights_of_nodes(self, nodes: Tensor | None, pose: int | None) -> Tensor:
         """Return the weights [K, J] at the active nodes, given as `nodes`, or at all nodes if None."""
@@ -244,46 +228,6 @@ class FieldOnGrid(nn.Module):
         values = self.weight_grid(active_only=True) if weights is None else weights.values
         of_poses = values if values.ndim == 5 else values[None]
         return torch.stack([total_variation(one, self.grid, self._used_nodes) for one in of_poses]).mean()
-
-    # ---------------------------------------------------------------- cells
-    def set_active_cells(self, cells: Tensor) -> None:
-        """Choose the cells that a complete search looks into, [D-1, H-1, W-1], bool; they are saved with the state.
-
-        Waits for a GPU, so that a search need not.
-
-        Raises:
-            ValueError: the shape or dtype differs, or no cell is left.
-        """
-        self._check_cells("active_cells", cells)
-        if not bool(cells.any()):
-            raise ValueError("active_cells: wanted at least one cell, got none")
-        self.active_cells.copy_(cells)
-        self._update_active_nodes()
-
-    def _check_cells(self, name: str, cells: Tensor) -> None:
-        wanted = [n - 1 for n in self.shape]
-        if not isinstance(cells, Tensor) or list(cells.shape) != wanted or cells.dtype != torch.bool:
-            came = f"{cells.dtype} {list(cells.shape)}" if isinstance(cells, Tensor) else type(cells).__name__
-            raise ValueError(f"{name}: wanted bool {wanted}, got {came}")
-
-    def _update_active_nodes(self) -> None:
-        """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
-        self.searches_all_cells = bool(self.active_cells.all())
-        self._used_nodes = corners_of(self.active_cells)
-        self._active_nodes = self._used_nodes.reshape(-1).nonzero()[:, 0]
-        self._active_points = self.grid.nodes(self.shape).reshape(-1, 3)[self._active_nodes]
-
-    def is_active(self, canonical: Tensor) -> Tensor:
-        """Return whether canonical points [N, 3] lie in cells that a complete search looks into, [N], bool."""
-        cell, local = locate(canonical, self.grid, self.shape)
-        return ((local >= 0) & (local <= 1)).all(1) & self.active_cells.reshape(-1)[cell]
-
-    def random_canonical(self, count: int, generator: torch.Generator) -> Tensor:
-        """Return canonical points [count, 3] spread evenly over the active cells, metres."""
-        cells = self.active_cells.nonzero()
-        chosen = torch.randint(len(cells), (count,), generator=generator).to(cells.device)
-        places = torch.rand(count, 3, generator=generator).to(self.lower)
-        return self.lower + (cells[chosen].flip(1) + places) * self.grid.cell_size(self.shape)
 
 
 def _after_load(module: FieldOnGrid, incompatible: object) -> None:

@@ -8,6 +8,7 @@ from dataclasses import InitVar, dataclass
 import torch
 from torch import Tensor
 
+from snarfcli.constants import constant
 from snarfcli.field_docs import documented
 
 __all__ = ["CORNERS", "CanonicalGrid", "cell_corners", "locate", "trilinear_weights"]
@@ -62,8 +63,7 @@ class CanonicalGrid:
 
     def cell_size(self, shape: Sequence[int]) -> Tensor:
         """Return the sides of one cell along x, y, z, [3], metres, for nodes laid out as `shape` = (D, H, W)."""
-        cells = torch.tensor([shape[2] - 1, shape[1] - 1, shape[0] - 1]).to(self.lower)
-        return (self.upper - self.lower) / cells
+        return (self.upper - self.lower) / _cells_along(shape, self.lower.device, self.lower.dtype)
 
     def nodes(self, shape: Sequence[int]) -> Tensor:
         """Return the canonical positions of the nodes, [D, H, W, 3], metres."""
@@ -82,9 +82,8 @@ def cell_corners(cells: Tensor, shape: Sequence[int]) -> Tensor:
     y = cells // (width - 1) % (height - 1)
     z = cells // ((width - 1) * (height - 1))
     first = (z * height + y) * width + x
-    corners = CORNERS.to(cells.device)
-    offsets = (corners[:, 2] * height + corners[:, 1]) * width + corners[:, 0]
-    return first[..., None] + offsets
+    offsets = [((k >> 2) * height + (k >> 1 & 1)) * width + (k & 1) for k in range(8)]
+    return first[..., None] + constant(offsets, cells.device)
 
 
 def locate(points: Tensor, grid: CanonicalGrid, shape: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -92,10 +91,15 @@ def locate(points: Tensor, grid: CanonicalGrid, shape: Sequence[int]) -> tuple[T
 
     Coordinates run from 0 to 1 inside a cell; a point outside the grid gets the nearest cell and coordinates beyond.
     """
-    cells = torch.tensor([shape[2] - 1, shape[1] - 1, shape[0] - 1], device=points.device)
+    cells = _cells_along(shape, points.device, torch.int64)
     scaled = (points - grid.lower) / grid.cell_size(shape)
     index = scaled.detach().floor().long().clamp_min(0).minimum(cells - 1)
     return (index[..., 2] * cells[1] + index[..., 1]) * cells[0] + index[..., 0], scaled - index
+
+
+def _cells_along(shape: Sequence[int], device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Return the numbers of cells along x, y, z, [3], between nodes laid out as `shape` = (D, H, W)."""
+    return constant([shape[2] - 1, shape[1] - 1, shape[0] - 1], device, dtype)
 
 
 def trilinear_weights(local: Tensor) -> Tensor:

@@ -191,7 +191,7 @@ class GridWeights(WeightField):
 
     def forward(self, canonical: Tensor) -> Tensor:
         """Return the skinning weights [N, J] at canonical points [N, 3]; outside the box, those of its border."""
-        cell, local = locate(canonical, CanonicalGrid(self.lower, self.upper), self.shape)
+        cell, local = locate(canonical, CanonicalGrid(self.lower, self.upper, checked=True), self.shape)
         phi = trilinear_weights(local.clamp(0, 1))
         return (phi[..., None] * self.at_nodes(cell_corners(cell, self.shape))).sum(-2)
 

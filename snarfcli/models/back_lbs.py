@@ -73,5 +73,5 @@ class BackLBS(PointwiseSystem):
 
     def joint_weights(self, joints: Tensor, bone_transforms: Tensor, pose: Tensor) -> Tensor:
         """Return the weights at the posed joints, [B, J, J]."""
-        posed = move_with_bones(joints, torch.arange(len(joints)), bone_transforms)
+        posed = move_with_bones(joints, torch.arange(len(joints), device=joints.device), bone_transforms)
         return self.posed_weights(posed, bone_transforms, pose)

@@ -17,6 +17,7 @@ from snarfcli.deformer import BonePrior, CanonicalGrid, Correspondences, Forward
 from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.skinning import skin
 from snarfcli.deformer.weights import VoxelWeights
+from snarfcli.draws import Draws
 from snarfcli.models.pieces import floating_cells
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.symmetry import find_mirror
@@ -44,6 +45,10 @@ class FoundRoots(Found):
     """The canonical points."""
     weights: NodeWeights | None
     """Skinning weights at the grid nodes; None for a field that was searched directly."""
+
+    @property
+    def total(self) -> Tensor:
+        return self.roots.total
 
 
 class FastSnarf(System):
@@ -115,9 +120,17 @@ class FastSnarf(System):
     def node_weights(self) -> NodeWeights | None:
         return self.deformer.node_weights()
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> FoundRoots:
+    def find(
+        self,
+        points: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        weights: NodeWeights | None = None,
+        capacity: int | None = None,
+    ) -> FoundRoots:
         weights = self.node_weights() if weights is None else weights
-        return FoundRoots(self.deformer(points, bone_transforms, weights=weights), weights)
+        roots = self.deformer(points, bone_transforms, capacity, weights)
+        return FoundRoots(roots if capacity is None else roots.unreported(), weights)
 
     def shape_at(self, found: FoundRoots, pose: Tensor, precision: str = "highest") -> FieldSamples:
         """Evaluate the shape network at the roots; a point gets their blend in training, and their maximum otherwise.
@@ -259,6 +272,13 @@ class FastSnarf(System):
         return dropped
 
     # ---------------------------------------------------------------- training
+    @property
+    def has_fixed_shapes(self) -> bool:
+        return not self.deformer.searches_field
+
+    def keep_room(self) -> None:
+        self.deformer.keep_room()
+
     def bone_logits(
         self,
         points: Tensor,
@@ -280,7 +300,7 @@ class FastSnarf(System):
         self,
         bone_transforms: Tensor,
         pose: Tensor,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: FoundRoots | None = None,
     ) -> dict[str, Tensor]:
@@ -294,9 +314,10 @@ class FastSnarf(System):
         pose: Tensor,
         made_up: Tensor,
         count: int,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: FoundRoots | None = None,
+        masks: bool = False,
     ) -> Tensor | None:
         """Return the cross-entropy at random canonical points in made-up poses, with labels from the training poses.
 
@@ -305,15 +326,23 @@ class FastSnarf(System):
         """
         if not self.shape.conditioned:
             return None
-        canonical = self.deformer.random_canonical(count, generator)
+        canonical = self.deformer.random_canonical(count, draws)
         weights = self._weights_seen(canonical, None if found is None else found.weights)
         with torch.no_grad():
             known = torch.stack([self._logits_in(one, canonical, weights, precision) for one in self.condition(pose)])
             inside = known.amin(0) > _SURE_LOGIT
-            sure = (inside | (known.amax(0) < -_SURE_LOGIT)).nonzero()[:, 0]
-        index = torch.randint(len(made_up), (len(sure),), generator=generator).to(sure.device)
+            is_sure = inside | (known.amax(0) < -_SURE_LOGIT)
+        condition = self.condition(made_up)
+        if masks:
+            # the n-th of the sure points has the n-th pose, as below
+            index = draws.integers(len(made_up), count)[(is_sure.cumsum(0) - 1).clamp_min(0)]
+            logits = self.canonical_logits(canonical, condition, index, precision, weights)
+            entropy = F.binary_cross_entropy_with_logits(logits, inside.to(logits), reduction="none")
+            return torch.where(is_sure, entropy, 0.0).sum() / count
+        sure = is_sure.nonzero()[:, 0]
+        index = draws.integers(len(made_up), len(sure))
         seen = None if weights is None else weights[sure]
-        logits = self.canonical_logits(canonical[sure], self.condition(made_up), index, precision, seen)
+        logits = self.canonical_logits(canonical[sure], condition, index, precision, seen)
         return F.binary_cross_entropy_with_logits(logits, inside[sure].to(logits), reduction="sum") / count
 
     def _logits_in(self, condition: Tensor, canonical: Tensor, weights: Tensor | None, precision: str) -> Tensor:
@@ -322,11 +351,9 @@ class FastSnarf(System):
         return self.canonical_logits(canonical, condition[None], one, precision, weights)
 
     @torch.no_grad()
-    def far_points(
-        self, count: int, bone_transforms: Tensor, generator: torch.Generator, weights: NodeWeights | None = None
-    ) -> Tensor:
+    def far_points(self, count: int, bone_transforms: Tensor, draws: Draws, weights: NodeWeights | None = None) -> Tensor:
         """Return random points of the searched cells, moved by the poses."""
-        canonical = self.deformer.random_canonical(count, generator)
+        canonical = self.deformer.random_canonical(count, draws)
         # without `weights`, the field itself at the points: to interpolate it, it would be evaluated at every node
         chosen = self.deformer.field(canonical) if weights is None else weights.at(canonical)
         return skin(canonical, chosen, bone_transforms)

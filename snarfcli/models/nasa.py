@@ -16,6 +16,7 @@ from snarfcli.bodies.extent import weight_segments
 from snarfcli.bodies.kinematics import invert_rigid
 from snarfcli.deformer import CanonicalGrid, NodeWeights
 from snarfcli.deformer.skinning import skin
+from snarfcli.draws import Draws
 from snarfcli.models.pointwise import PointwiseSystem, every_point, move_with_bones
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.system import FieldSamples, Found
@@ -89,7 +90,14 @@ class Nasa(PointwiseSystem):
     def _make_shape(self, bones: Tensor, box: tuple[Tensor, Tensor]) -> PartNetworks:
         return PartNetworks(self.config.model, self.num_bones)
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
+    def find(
+        self,
+        points: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        weights: NodeWeights | None = None,
+        capacity: int | None = None,
+    ) -> Found:
         return self._bone_frames(points, bone_transforms)
 
     def shape_at(self, found: BoneFrames, pose: Tensor, precision: str = "highest") -> FieldSamples:
@@ -140,7 +148,7 @@ class Nasa(PointwiseSystem):
         self,
         bone_transforms: Tensor,
         pose: Tensor,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: Found | None = None,
     ) -> dict[str, Tensor]:
@@ -153,7 +161,7 @@ class Nasa(PointwiseSystem):
             return {}
         if self._vertices is None or self._vertex_weights is None:
             raise ValueError(f"template: wanted the subject's mesh to train {config.name}, got none")
-        chosen = torch.randint(len(self._vertices), (config.part_points,), generator=generator).to(self._vertices.device)
+        chosen = draws.integers(len(self._vertices), config.part_points)
         vertices, weights = self._vertices[chosen], self._vertex_weights[chosen]
         posed = skin(vertices, weights, bone_transforms)
         wanted = _ON_SURFACE * F.one_hot(weights.argmax(1), self.num_bones).T.to(weights)

@@ -75,7 +75,14 @@ class PointwiseSystem(System):
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         """Build the parts of the system besides its shape; the arguments are those of the constructor."""
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
+    def find(
+        self,
+        points: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        weights: NodeWeights | None = None,
+        capacity: int | None = None,
+    ) -> Found:
         with matmul_precision("highest"), torch.autocast(points.device.type, enabled=False):
             return FoundPoints(*self.canonical_points(points, bone_transforms, pose))
 
@@ -96,7 +103,8 @@ class PointwiseSystem(System):
 
     def posed_box(self, bone_transforms: Tensor) -> tuple[Tensor, Tensor]:
         """Return the box around the posed joints, widened by the largest distance of the body from its bones."""
-        joints = move_with_bones(self._joints, torch.arange(self.num_bones), bone_transforms[None])[0]
+        every = torch.arange(self.num_bones, device=self._joints.device)
+        joints = move_with_bones(self._joints, every, bone_transforms[None])[0]
         return (joints.amin(0) - self.reach).cpu(), (joints.amax(0) + self.reach).cpu()
 
 

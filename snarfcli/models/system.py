@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid, NodeWeights, SearchConfig
 from snarfcli.deformer.skinning import skin
+from snarfcli.draws import Draws
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.precision import network_precision
 from snarfcli.shape import CONDITIONS, OccupancyNetwork, joints_of_bones
@@ -37,13 +38,18 @@ class FieldSamples:
     """[B, N], number of correspondences per point."""
 
     @property
-    def correspondences(self) -> int:
-        """Number of correspondences of all points."""
-        return int(self.counts.sum())
+    def correspondences(self) -> Tensor:
+        """Number of correspondences of all points, []."""
+        return self.counts.sum()
 
 
 class Found:
     """Where posed points come from: what a system's `find` returns and its `shape_at` takes."""
+
+    @property
+    def total(self) -> Tensor | None:
+        """Number of correspondences found, [1], also of those beyond a capacity; None if each point has one."""
+        return None
 
 
 def pose_angles(pose: Tensor) -> Tensor:
@@ -119,11 +125,20 @@ class System(nn.Module):
         """Evaluate the skinning weights that `find` and `far_points` share; None in a system that shares none."""
         return None
 
-    def find(self, points: Tensor, bone_transforms: Tensor, pose: Tensor, weights: NodeWeights | None = None) -> Found:
+    def find(
+        self,
+        points: Tensor,
+        bone_transforms: Tensor,
+        pose: Tensor,
+        weights: NodeWeights | None = None,
+        capacity: int | None = None,
+    ) -> Found:
         """Go back to the canonical frame, in full float32; arguments as in `forward`.
 
         Args:
             weights: from `node_weights`, if they have been evaluated already.
+            capacity: maximum number of correspondences, which fixes the shapes of what follows (see `has_fixed_shapes`); None
+                for as many as there are. No effect in a system with one for each point.
         """
         raise NotImplementedError
 
@@ -179,6 +194,14 @@ class System(nn.Module):
         return weights @ self._joints_of_bones
 
     # ---------------------------------------------------------------- training
+    @property
+    def has_fixed_shapes(self) -> bool:
+        """Whether no shape in a step depends on values if `find` gets a capacity, so that a step can be captured."""
+        return True
+
+    def keep_room(self) -> None:
+        """Keep what changes between steps in its place in memory, as long as it fits; called before steps are captured."""
+
     def bone_logits(
         self,
         points: Tensor,
@@ -215,7 +238,7 @@ class System(nn.Module):
         self,
         bone_transforms: Tensor,
         pose: Tensor,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: Found | None = None,
     ) -> dict[str, Tensor]:
@@ -224,7 +247,7 @@ class System(nn.Module):
         Args:
             bone_transforms: [B, J, 4, 4].
             pose: [B, J, 3].
-            generator: of random numbers.
+            draws: random numbers.
             precision: of the networks.
             found: from `find` with the same parameters; what it has evaluated is then not evaluated again.
         """
@@ -235,9 +258,10 @@ class System(nn.Module):
         pose: Tensor,
         made_up: Tensor,
         count: int,
-        generator: torch.Generator,
+        draws: Draws,
         precision: str = "highest",
         found: Found | None = None,
+        masks: bool = False,
     ) -> Tensor | None:
         """Return a loss that keeps the canonical shape in made-up poses where training poses agree; None if not known.
 
@@ -245,14 +269,15 @@ class System(nn.Module):
             pose: [B, J, 3], of training frames.
             made_up: [P, J, 3].
             count: number of canonical points.
-            generator: of random numbers.
+            draws: random numbers.
             precision: of the network.
             found: from `find` with the same parameters; what it has evaluated is then not evaluated again.
+            masks: whether points that do not count are masked, so that all shapes are fixed, instead of left out.
         """
         return None
 
     def far_points(
-        self, count: int, bone_transforms: Tensor, generator: torch.Generator, weights: NodeWeights | None = None
+        self, count: int, bone_transforms: Tensor, draws: Draws, weights: NodeWeights | None = None
     ) -> Tensor | None:
         """Return posed points [B, count, 3] where the field may be occupied, also away from samples; None if not known.
 

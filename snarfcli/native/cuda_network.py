@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from snarfcli.native.cuda_driver import KernelLauncher, gpu
+from snarfcli.native import cuda_driver
+from snarfcli.native.cuda_driver import KernelLauncher
 
 __all__ = ["NetworkArrays", "evaluate_network", "fits", "run_network"]
 
@@ -125,7 +126,7 @@ class NetworkArrays:
 def evaluate_network(arrays: NetworkArrays, precision: str) -> Tensor | None:
     """Return the logits [N] on the GPU of the points, or None for a network that `fits` rejects; never waits for the GPU."""
     with torch.cuda.device(arrays.points.device):
-        launcher = gpu(arrays.points)
+        launcher = cuda_driver.gpu(arrays.points)
         return run_network(launcher, arrays, precision) if fits(launcher, arrays, precision) else None
 
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from snarfcli.constants import constant
 from snarfcli.native import cpu_networks
 from snarfcli.native.backend import choose_backend
 
@@ -26,26 +27,41 @@ def encode_reference(
     """The readable version of `encode`."""
     angles = (points[:, None] * frequencies[:, None]).flatten(1)
     parts = [points, angles.sin(), angles.cos()]
+    if nodes:
+        parts.append(_features(points, table, rows, nodes, boxes).flatten(1))
+    return torch.cat(parts, 1)
+
+
+def _features(points: Tensor, table: Tensor, rows: Tensor, nodes: Sequence[int], boxes: Sequence[float]) -> Tensor:
+    """Return the features [N, levels, F] of the grids at points [N, 3], all levels and corners at once."""
+    box = constant(boxes, points.device, points.dtype).view(-1, 2, 3)
+    last = constant([count - 1 for count in nodes], points.device).view(-1, 3)
+    place = (points[:, None] - box[:, 0]) / box[:, 1]
+    is_inside = ((place >= 0) & (place <= last)).all(2)
+    cell = torch.minimum(place.detach().nan_to_num().clamp_min(0).long(), last - 1)
+    local = place - cell
+    x, y, z = (torch.stack([1 - along, along], 2) for along in local.unbind(2))
+    shares = (z[..., :, None, None] * y[..., None, :, None] * x[..., None, None, :]).flatten(2)
+    strides, offsets, starts = _node_numbers(nodes)
+    first = (cell * constant(strides, points.device).view(-1, 3)).sum(2) + constant(starts, points.device)
+    at = first[..., None] + constant(offsets, points.device).view(-1, 8)
     padded = torch.cat([table, table.new_zeros(1, table.shape[1])])  # row -1: zeros
-    start = 0
+    row = rows.index_select(0, at.flatten()).long() % len(padded)
+    values = padded.index_select(0, row).view(*at.shape, table.shape[1])  # whose gradient is faster than that of an index
+    return torch.where(is_inside[..., None], (shares[..., None] * values).sum(2), 0)
+
+
+def _node_numbers(nodes: Sequence[int]) -> tuple[list[int], list[int], list[int]]:
+    """Return by how much the number of a node rises along x, y, z, and to a cell's corners; and the first of each level."""
+    strides, offsets, starts, start = [], [], [], 0
     for level in range(len(nodes) // 3):
         width, height, depth = nodes[3 * level : 3 * level + 3]
-        lower, size = points.new_tensor(boxes[6 * level : 6 * level + 6]).view(2, 3)
-        place = (points - lower) / size
-        limit = torch.tensor([width - 1, height - 1, depth - 1], device=points.device)
-        is_inside = ((place >= 0) & (place <= limit)).all(1)
-        cell = torch.minimum(place.detach().nan_to_num().clamp_min(0).long(), limit - 1)
-        local = place - cell
-        features = points.new_zeros(len(points), table.shape[1])
-        for corner in range(8):
-            step = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2], device=points.device)
-            share = torch.where(step.bool(), local, 1 - local).prod(1)
-            at = cell + step
-            node = (at[:, 2] * height + at[:, 1]) * width + at[:, 0]
-            features = features + share[:, None] * padded[rows[start + node].long()]
-        parts.append(torch.where(is_inside[:, None], features, torch.zeros_like(features)))
+        along = [1, width, width * height]
+        strides += along
+        offsets += [sum(step for axis, step in enumerate(along) if corner >> axis & 1) for corner in range(8)]
+        starts.append(start)
         start += width * height * depth
-    return torch.cat(parts, 1)
+    return strides, offsets, starts
 
 
 def run_encoding(

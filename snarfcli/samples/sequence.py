@@ -105,6 +105,14 @@ class SequenceSamples:
         cells = self._cells[frames] if index is None else self._cells[rows, index]
         return dequantise(cells, self._cube_lower[frames][..., None, :], self._cube_size[frames][..., None, None])
 
+    def stored_points(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return all points of frames [B] as they are stored, see `dequantise`.
+
+        Returns:
+            The cells [B, P, 3], uint16, and the lower corners [B, 3] and sides [B] of the cubes, float32, metres.
+        """
+        return self._cells[frames], self._cube_lower[frames], self._cube_size[frames]
+
     def occupancies(self, frames: int | np.ndarray, index: np.ndarray | None = None) -> np.ndarray:
         """Return the labels [..., N], bool, True inside, of the points that `points` returns."""
         frames, rows = _rows(frames, index)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ class Batch:
     pose: Tensor
     """[B, J, 3] axis-angle, radians."""
     frames: list[Frame]
-    """B pairs of a sequence and the index of a frame."""
+    """B pairs of a sequence and the index of a frame; empty if they were drawn on the device."""
     cube: Tensor
     """[B, 2, 3], lower and upper corner of the cube that holds the points of a frame, metres; outside, nothing is occupied."""
 
@@ -49,6 +50,9 @@ class FrameBatches:
         device: of the batches.
     """
 
+    are_static: ClassVar[bool] = False
+    """Whether static steps can read them: `batch` also takes a tensor, after `stage`."""
+
     def __init__(self, store: SampleStore, config: TrainingConfig, seed: int, device: torch.device) -> None:
         self.sequences = store.sequences("train")
         self.frames = [(index, int(frame)) for index, s in enumerate(self.sequences) for frame in s.train_frames]
@@ -56,9 +60,9 @@ class FrameBatches:
             raise UserError('the samples have no training frames; run "snarf preprocess" with the training sequences')
         self.config, self.seed, self.device = config, seed, device
 
-    def batch(self, step: int) -> Batch:
-        """Return the batch of one step."""
-        random = np.random.default_rng([self.seed, step])
+    def batch(self, step: int | Tensor) -> Batch:
+        """Return the batch of one step, given as a number, or as a tensor [], int64, if `are_static`."""
+        random = np.random.default_rng([self.seed, int(step)])
         count = self.config.poses_per_step
         chosen = random.choice(len(self.frames), count, replace=count > len(self.frames))
         picks = []
@@ -69,6 +73,9 @@ class FrameBatches:
             surface = random.integers(half, sequence.num_points, self.config.surface_points)
             picks.append((sequence, self.frames[index][1], np.concatenate([uniform, surface])))
         return load_frames(picks, self.device)
+
+    def stage(self, step: int) -> None:
+        """Prepare the batch of a static step that is started next."""
 
     def with_poses(self, batch: Batch) -> Batch:
         """Return a batch with the present poses of its frames, which may have been refined."""
@@ -109,15 +116,19 @@ class FreshBatches(FrameBatches):
         workers = config.workers if config.workers is not None else min(_MOST_WORKERS, max(1, count_cores() - 1))
         self._ahead = Prefetch(draw_steps, (self._fresh,), workers, "training.workers=1") if workers else None
 
-    def batch(self, step: int) -> Batch:
+    def batch(self, step: int | Tensor) -> Batch:
         """Return the batch of one step; waits until it is ready.
 
         Raises:
             UserError: a mesh cannot be used, or a process ended early. All processes have ended then.
         """
+        return self.drawn(int(step), self.device)
+
+    def drawn(self, step: int, device: torch.device | str = "cpu") -> Batch:
+        """Return the batch of one step on another device; as `batch`."""
         drawn: DrawnPoints = self._ahead.get(step) if self._ahead else self._fresh.draw(step)
         picks = [(self.sequences[sequence], frame) for sequence, frame in drawn.frames]
-        return _gather(picks, drawn.points, drawn.occupied, self.device)
+        return _gather(picks, drawn.points, drawn.occupied, torch.device(device))
 
     def close(self) -> None:
         if self._ahead:

@@ -12,13 +12,17 @@ from typing import Any
 from snarfcli.files import write_tensors
 from snarfcli.interrupts import interrupts_noted
 from snarfcli.progress import progress_bar
+from snarfcli.training.numbers import History
+from snarfcli.training.schedule import learning_rate
 from snarfcli.training.trainer import Trainer
 
 __all__ = ["train"]
 
 log = logging.getLogger(__name__)
 _REPORT_EVERY_S = 15.0
+_SHOW_EVERY_S = 0.5  # on a terminal; reading the losses waits for a GPU
 _LAST_STEPS = 50  # reported losses are means over this number of steps
+_SCALARS_EVERY = 20  # steps
 
 
 def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str, float]], None]) -> dict[str, Any]:
@@ -37,8 +41,8 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
     """
     config = trainer.config
     first_step, seconds_before = trainer.step, trainer.seconds
-    start, reported = time.monotonic(), 0.0
-    recent: list[dict[str, float]] = []
+    start, shown_at = time.monotonic(), 0.0
+    recent, written = History(_LAST_STEPS), first_step
     validation: dict[str, float] = {}
     points_per_step = config.poses_per_step * (config.uniform_points + config.surface_points)
     paused = 0.0
@@ -46,14 +50,14 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
     bar = progress_bar(total=config.steps, done=first_step, desc="train", unit="step")
     with closing(trainer.batches), interrupts_noted(_tell_of_interrupt) as interrupt, bar as shown:
         while trainer.step < config.steps:
-            recent = [*recent, trainer.advance()][-_LAST_STEPS:]
+            numbers = trainer.advance()
             step, last = trainer.step, trainer.step == config.steps
+            recent.add(step, numbers)
             seconds = time.monotonic() - start - paused
             trainer.seconds = seconds_before + seconds
             speed = (step - first_step) / max(seconds, 1e-9)
-            if step % 20 == 0 or last:
-                on_scalars(step, recent[-1] | {"learning_rate": trainer.learning_rate()})
-                on_scalars(step, {"points_per_second": speed * points_per_step})
+            if step % _LAST_STEPS == 0 or last:
+                written = _write_scalars(on_scalars, recent, written, trainer, speed * points_per_step)
             validates = step % config.validate_every == 0 or last
             if interrupt or validates or step % config.checkpoint_every == 0:
                 write_tensors(folder / "checkpoint.pt", trainer.state())
@@ -65,14 +69,16 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
                     validation = trainer.validate()
                 on_scalars(step, {f"validation_{name}": value for name, value in validation.items()})
                 paused += time.monotonic() - before
-            line = _line(recent, validation, speed * points_per_step)
             if shown is not None:
-                shown.update(1)
-                shown.set_postfix_str(line, refresh=False)
-            elif seconds + paused - reported >= _REPORT_EVERY_S or last:
-                reported = seconds + paused
-                remaining = (config.steps - step) / speed
-                log.info("step %d of %d, %s, %.0f s left", step, config.steps, line, remaining)
+                shown.update(step - shown.n)
+            since = seconds + paused - shown_at
+            if since >= (_REPORT_EVERY_S if shown is None else _SHOW_EVERY_S) or last:
+                shown_at = seconds + paused
+                line = _line(recent, validation, speed * points_per_step)
+                if shown is not None:
+                    shown.set_postfix_str(line, refresh=False)
+                else:
+                    log.info("step %d of %d, %s, %.0f s left", step, config.steps, line, (config.steps - step) / speed)
         if interrupt:  # after the last step: the checkpoint has it
             raise interrupt.as_error()
     seconds = time.monotonic() - start - paused
@@ -85,26 +91,34 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
         "validation_seconds": round(paused, 2),
         "seconds_per_step": round(trainer.seconds / trainer.step, 4) if trainer.step else None,
         "points_per_second": round(points_per_step * steps / seconds) if steps else None,
-        "inside_without_correspondence": _mean(recent, "inside_without_correspondence"),
+        "inside_without_correspondence": recent.means().get("inside_without_correspondence", 0.0),
     }
 
 
-def _line(recent: list[dict[str, float]], validation: dict[str, float], points_per_second: float) -> str:
+def _write_scalars(
+    on_scalars: Callable[[int, dict[str, float]], None], recent: History, written: int, trainer: Trainer, points: float
+) -> int:
+    """Pass on the numbers of every 20th step after `written`, and of the last; return the last step that was passed on."""
+    for step, numbers in recent.since(written + 1):
+        if step % _SCALARS_EVERY == 0 or step == trainer.config.steps:
+            rates = {"learning_rate": learning_rate(trainer.config, step), "points_per_second": points}
+            on_scalars(step, dict(numbers) | rates)
+            written = step
+    return written
+
+
+def _line(recent: History, validation: dict[str, float], points_per_second: float) -> str:
     """Return losses, speed and validation as one short line."""
-    names = [n for n in recent[-1] if n not in ("total", "inside_without_correspondence", "correspondences_per_point")]
-    losses = ", ".join(f"{name.replace('_', ' ')} {_mean(recent, name):.4f}" for name in names)
-    lost = _mean(recent, "inside_without_correspondence")
+    means = recent.means()
+    hidden = ("total", "inside_without_correspondence", "correspondences_per_point")
+    losses = ", ".join(f"{name.replace('_', ' ')} {mean:.4f}" for name, mean in means.items() if name not in hidden)
+    lost = means["inside_without_correspondence"]
     parts = [f"loss {losses}", f"{points_per_second / 1000:.0f}k points/s"]
     if lost:
         parts.append(f"lost {100 * lost:.2f} % of inside points")
     if validation:
         parts.append(f"IoU {100 * validation['iou_bbox']:.1f}/{100 * validation['iou_surface']:.1f}")
     return ", ".join(parts)
-
-
-def _mean(recent: list[dict[str, float]], name: str) -> float:
-    values = [numbers[name] for numbers in recent if name in numbers]
-    return sum(values) / len(values) if values else 0.0
 
 
 def _tell_of_interrupt() -> None:

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from snarfcli.draws import Draws
+
 __all__ = ["JOINT_TARGETS", "joint_weight_targets", "occupancy_loss", "points_on_bones"]
 
 JOINT_TARGETS = ("halves", "parent", "own")
@@ -31,9 +33,9 @@ def occupancy_loss(logits: Tensor, occupied: Tensor, found: Tensor) -> Tensor:
     return torch.where(found, entropy, 0.0).sum() / max(logits.numel(), 1)
 
 
-def points_on_bones(bones: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def points_on_bones(bones: Tensor, count: int, draws: Draws) -> Tensor:
     """Return `count` random points on each bone [S, 2, 3], [S * count, 3], canonical frame, metres (SNARF Sec. 3.3)."""
-    share = torch.rand(len(bones), count, 1, generator=generator).to(bones)
+    share = draws.uniform(len(bones), count, 1).to(bones)
     return (bones[:, :1] + share * (bones[:, 1:] - bones[:, :1])).reshape(-1, 3)
 
 

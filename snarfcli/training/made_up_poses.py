@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from snarfcli.draws import Draws
+
 __all__ = ["MadeUpPoses"]
 
 _FARTHEST = 2.0  # from the mean pose, as a multiple of a joint's difference from it in a training pose
@@ -26,18 +28,18 @@ class MadeUpPoses:
     def __init__(self, poses: Tensor) -> None:
         self._poses, self._mean = poses, poses.mean(0)
 
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+    def draw(self, count: int, draws: Draws) -> Tensor:
         """Return `count` poses, [count, J, 3], axis-angle, radians.
 
         Args:
             count: number of poses.
-            generator: of random numbers, on the CPU.
+            draws: random numbers, on the device of the poses.
         """
         frames, joints, _ = self._poses.shape
-        frame = torch.randint(frames, (count, joints), generator=generator)
-        reach = _FARTHEST * torch.rand(count, joints, 1, generator=generator)
-        axis = F.normalize(torch.randn(count, joints, 3, generator=generator), dim=-1)
-        turn = _LARGEST_TURN_RAD * torch.rand(count, joints, 1, generator=generator).square()
-        turns = torch.rand(count, joints, 1, generator=generator) < 0.5
-        seen = self._poses[frame.to(self._poses.device), torch.arange(joints, device=self._poses.device)]
+        frame = draws.integers(frames, count, joints)
+        reach = _FARTHEST * draws.uniform(count, joints, 1)
+        axis = F.normalize(draws.normal(count, joints, 3), dim=-1)
+        turn = _LARGEST_TURN_RAD * draws.uniform(count, joints, 1).square()
+        turns = draws.uniform(count, joints, 1) < 0.5
+        seen = self._poses[frame, torch.arange(joints, device=self._poses.device)]
         return self._mean + reach.to(seen) * (seen - self._mean) + (axis * turn * turns).to(seen)

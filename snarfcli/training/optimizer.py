@@ -47,6 +47,10 @@ class AveragedAdam:
     def _trained(self) -> list[nn.Parameter]:
         return [parameter for parameter in self._model.parameters() if parameter.requires_grad]
 
+    def tensors(self) -> list[Tensor]:
+        """Return all that a step changes: parameters, moments and averages."""
+        return [*self.parameters, *self._first, *self._second, *self.average]
+
     def zero_gradients(self) -> None:
         """Forget the gradients of the last step."""
         for parameter in self.parameters:

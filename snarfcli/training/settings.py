@@ -33,6 +33,9 @@ class TrainingConfig:
     """Whether every step draws and labels new points from the stored meshes, instead of choosing among the stored points."""
     workers: int | None = MISSING
     """Number of processes that make fresh points ahead of time; null: by the number of cores. Does not change the avatar."""
+    graph: str = MISSING
+    """Whether steps have fixed shapes and run as CUDA graphs: auto (on CUDA devices), on (fixed shapes on every device) or off.
+    Does not change the avatar beyond rounding and other random numbers."""
     learning_rate: float = MISSING
     """Maximum learning rate of Adam."""
     feature_rate: float = MISSING

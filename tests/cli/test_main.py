@@ -92,6 +92,7 @@ WRONG = {
     ("train", "seed=-1"): "seed: wanted at least 0, got -1",
     ("train", "training.validate_every=0"): "training.validate_every: wanted at least 1, got 0",
     ("train", "training.precision=half"): "training.precision: wanted highest, high, medium or bfloat16, got 'half'",
+    ("train", "training.graph=yes"): "training.graph: wanted auto, on or off, got 'yes'",
     ("train", "skinning.resolution=[8,8]"): "skinning.resolution: wanted three numbers, along x, y and z, got [8, 8]",
     ("train", "search.jacobian=exat"): "search.jacobian: wanted exact or broyden, got 'exat'; did you mean 'exact'?",
     ("eval", "search=null"): "there is no search=null; choose from broyden, complete, snarf, or leave it out",

@@ -14,6 +14,7 @@ from toy_training import avatar_config, toy_store, training_config
 from snarfcli.avatar import Avatar
 from snarfcli.deformer import CanonicalGrid, SearchConfig
 from snarfcli.deformer.skinning import skin
+from snarfcli.draws import GeneratorDraws
 from snarfcli.errors import UserError
 from snarfcli.models.nasa import PartNetworks
 from snarfcli.models.pointwise import invert_blended
@@ -209,9 +210,9 @@ def test_parts_start_as_capsules_around_their_bones(store):
 
 def test_surface_points_belong_to_one_part(store):
     avatar = new_system(store, "nasa", part_weight=2.0, part_points=64)
-    template, generator = template_of(store), torch.Generator().manual_seed(3)
+    template, draws = template_of(store), GeneratorDraws.seeded(3)
     transforms = avatar.bone_transforms(POSES)
-    loss = avatar.model.extra_losses(transforms, POSES, generator)["parts"]
+    loss = avatar.model.extra_losses(transforms, POSES, draws)["parts"]
     chosen = torch.randint(len(template.vertices), (64,), generator=torch.Generator().manual_seed(3))
     wanted = 0.0
     for one in transforms:
@@ -268,7 +269,7 @@ def test_the_weight_field_is_evaluated_once_per_step(store, monkeypatch):
     field.register_forward_hook(lambda *_: calls.append(1))
     found = model.find(torch.rand(2, 20, 3, generator=torch.Generator().manual_seed(0)), transforms, POSES)
     model.shape_at(found, POSES)
-    points, owner = model.deformer.random_canonical(4, torch.Generator().manual_seed(0)), torch.tensor([0, 1, 0, 1])
+    points, owner = model.deformer.random_canonical(4, GeneratorDraws.seeded(0)), torch.tensor([0, 1, 0, 1])
     handed_on = model.bone_logits(points, owner, transforms, POSES, found=found)
     assert len(calls) == 1
     torch.testing.assert_close(handed_on, model.bone_logits(points, owner, transforms, POSES))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from toy_training import new_avatar, toy_store, training_config
 
+from snarfcli.draws import GeneratorDraws
 from snarfcli.training.trainer import Trainer
 
 
@@ -19,7 +20,7 @@ def test_far_points_are_outside_the_cubes(tmp_path):
     tight = replace(batch, cube=torch.stack([batch.cube[:, 0] + 0.3 * half, batch.cube[:, 1] - 0.3 * half], 1))
     count = batch.points.shape[1]
     for given in (batch, tight):
-        more = trainer._with_far_points(given, trainer.model.node_weights())
+        more = trainer.objective.with_far_points(given, trainer.model.node_weights(), trainer._draws)
         assert torch.equal(more.points[:, :count], batch.points)
         assert torch.equal(more.occupied[:, :count], batch.occupied)
         far = more.points[:, count:]
@@ -33,13 +34,13 @@ def test_far_points_are_outside_the_cubes(tmp_path):
     assert 0.05 < reached.float().mean() < 0.95
     assert (far[~reached].norm(dim=1) > 5).all()
     assert (far[reached].norm(dim=1) < 3).all()
-    again = trainer._with_far_points(tight, trainer.model.node_weights())
+    again = trainer.objective.with_far_points(tight, trainer.model.node_weights(), trainer._draws)
     assert torch.equal(again.points, more.points)  # a resumed run draws the same
 
 
 def test_random_canonical_points_fill_the_active_cells(tmp_path):
     deformer = new_avatar(toy_store(tmp_path)).model.deformer
-    points = deformer.random_canonical(4000, torch.Generator().manual_seed(0))
+    points = deformer.random_canonical(4000, GeneratorDraws.seeded(0))
     assert deformer.is_active(points).all()
     spread = (points.amax(0) - points.amin(0)) / (deformer.upper - deformer.lower)
     assert (spread > 0.5).all()

@@ -111,7 +111,7 @@ def test_hierarchical_weights_learn_the_joint_target(config_for, store):
     trainer = new_trainer(config, store, torch.device("cpu"))
     for _ in range(40):
         trainer.advance()
-    weights = trainer.model.deformer.field(trainer.joints)
+    weights = trainer.model.deformer.field(trainer.objective.joints)
     torch.testing.assert_close(weights.detach(), torch.eye(2), atol=0.15, rtol=0)
 
 

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from snarfcli.draws import GeneratorDraws
 from snarfcli.training.losses import joint_weight_targets, occupancy_loss, points_on_bones
 
 
@@ -49,7 +50,7 @@ def test_unknown_joint_target_is_rejected():
 
 def test_points_lie_on_their_bones():
     bones = torch.tensor([[[0.0, 0, 0], [1.0, 0, 0]], [[1.0, 0, 0], [1.0, 2.0, 0]]])
-    points = points_on_bones(bones, 50, torch.Generator().manual_seed(0)).reshape(2, 50, 3)
+    points = points_on_bones(bones, 50, GeneratorDraws.seeded(0)).reshape(2, 50, 3)
     assert bool((points[0, :, 1:] == 0).all())
     assert bool(((points[0, :, 0] >= 0) & (points[0, :, 0] <= 1)).all())
     assert bool((points[1, :, 0] == 1).all())

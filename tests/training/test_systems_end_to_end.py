@@ -25,7 +25,7 @@ from snarfcli.models.settings import ModelConfig
 from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.samples.store import SampleStore
 from snarfcli.shape import ConditionConfig
-from snarfcli.training import trainer as trainer_module
+from snarfcli.training import objective as objective_module
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Diverged
 
 
@@ -141,7 +141,7 @@ def test_settings_of_a_system_that_cannot_be_used_are_rejected(config_for):
 def test_a_diverged_run_stops_keeps_its_checkpoint_and_says_so(config_for, monkeypatch, what):
     config = config_for("fast_snarf", steps=12)
     calls = []
-    true_loss = trainer_module.occupancy_loss
+    true_loss = objective_module.occupancy_loss
 
     def spoilt(logits, occupied, found):
         calls.append(1)
@@ -151,7 +151,7 @@ def test_a_diverged_run_stops_keeps_its_checkpoint_and_says_so(config_for, monke
         # a square root of zero has a value and no gradient
         return loss * math.nan if what == "loss" else loss + (loss - loss).sqrt()
 
-    monkeypatch.setattr(trainer_module, "occupancy_loss", spoilt)
+    monkeypatch.setattr(objective_module, "occupancy_loss", spoilt)
     with pytest.raises(Diverged, match=f"diverged: the {what} is nan at step 6; lower training.learning_rate"):
         run(config)
     folder = Path(config.output_root) / "builtin" / "toy" / "fast_snarf"

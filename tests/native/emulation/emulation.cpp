@@ -4,6 +4,7 @@
 #include "broyden.cu"
 #include "candidates.cu"
 #include "complete.cu"
+#include "draws.cu"
 #include "gather.cu"
 #include "implicit.cu"
 #include "optimizer.cu"
@@ -26,6 +27,7 @@ const NamedKernel<const Search<Number>> search_kernels[] = {
     {"write_roots", write_roots},
 };
 const NamedKernel<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
+const NamedKernel<const DrawTask> draw_kernels[] = {{"draw_bits", draw_bits}};
 const NamedKernel<const AdamLaunch> optimizer_kernels[] = {
     {"check_gradients", check_gradients},
     {"update_parameters", update_parameters},
@@ -37,6 +39,7 @@ const NamedKernel<const AdamLaunch> optimizer_kernels[] = {
 extern "C" bool emulate(const char* name, const void* arguments, unsigned x, unsigned y, unsigned threads) {
   return run_named(search_kernels, name, arguments, x, y, threads) ||
          run_named(backward_kernels, name, arguments, x, y, threads) ||
+         run_named(draw_kernels, name, arguments, x, y, threads) ||
          run_named(optimizer_kernels, name, arguments, x, y, threads);
 }
 extern "C" size_t search_bytes() { return sizeof(Search<Number>); }

@@ -130,7 +130,7 @@ def random_bits(step: Tensor, key: int, count: int) -> Tensor:
 
 @random_bits.register_kernel("cuda")
 def _(step, key, count):
-    if choose_backend("auto", "cuda") == "native":
+    if choose_backend("auto", step.device) == "native":
         return cuda_draws.random_bits(step, key, count)
     return _random_bits_reference(step, key, count)
 

@@ -9,6 +9,7 @@ import torch
 
 from snarfcli.errors import is_out_of_memory
 from snarfcli.models.system import System
+from snarfcli.native import backend
 from snarfcli.samples.store import SampleStore
 from snarfcli.training.batches import FrameBatches, new_batches
 from snarfcli.training.device_batches import DeviceBatches
@@ -116,7 +117,7 @@ def choose_batches(store: SampleStore, config: TrainingConfig, seed: int, device
     if config.graph not in GRAPHS:
         raise ValueError(f"training.graph: wanted {', '.join(GRAPHS[:-1])} or {GRAPHS[-1]}, got {config.graph!r}")
     wants = config.graph == "on" or (config.graph == "auto" and device.type == "cuda")
-    why_not = _why_no_fixed_shapes(config, model) if wants else None
+    why_not = _why_no_fixed_shapes(config, model, device) if wants else None
     if not wants or why_not:
         if why_not:
             log.info("the training step is not captured in a CUDA graph: %s", why_not)
@@ -133,10 +134,13 @@ def choose_batches(store: SampleStore, config: TrainingConfig, seed: int, device
     return batches
 
 
-def _why_no_fixed_shapes(config: TrainingConfig, model: System) -> str | None:
+def _why_no_fixed_shapes(config: TrainingConfig, model: System, device: torch.device) -> str | None:
     """Return why the steps of a training cannot have fixed shapes on the device, or None if they can."""
     if config.refine_poses:
         return "training.refine_poses=true changes the samples in every step"
     if not model.has_fixed_shapes:
         return "a search in the weight field itself, as of model=snarf, has as many results as it finds"
+    if model.search is not None and device.type == "cuda":
+        reason = "search.backend=reference" if model.search.backend == "reference" else backend.why_no_kernels(device)
+        return None if reason is None else f"the search in PyTorch waits for the GPU ({reason})"
     return None

@@ -1,4 +1,4 @@
-"""Steps with fixed shapes on batches that are drawn on the device, against the eager step on the same draws. All on a CPU."""
+"""Steps with fixed shapes on batches that are drawn on the device, against the eager step on the same draws."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def grids_config():
     return replace(plain, shape=shape, skinning=replace(plain.skinning, name="voxel", smoothness=1e-3))
 
 
-def trainer_for(store, architecture=None, **changes) -> Trainer:
+def trainer_for(store, architecture=None, device=CPU, **changes) -> Trainer:
     torch.manual_seed(0)
     small = {"poses_per_step": 2, "uniform_points": 60, "surface_points": 60, "agreement_weight": 1.0, "graph": "on"}
     config = training_config(**(small | {"learning_rate": 1e-3, "steps": 100} | changes))
-    return Trainer(new_avatar(store, architecture), store, config, 0, CPU)
+    return Trainer(new_avatar(store, architecture), store, config, 0, device)
 
 
 def preset_trainer(store, name: str, changes: list[str]) -> Trainer:
@@ -137,6 +137,19 @@ def test_a_run_follows_the_eager_run(store, architecture):
     assert one._ahead._static.progress().step == 30
     assert largest_difference(one.optimizer.average, other.optimizer.average, 1e-3) <= 1e-2
     assert torch.equal(one.model.deformer.active_cells, other.model.deformer.active_cells)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("fresh_points", [False, True])
+def test_on_a_gpu_captured_steps_follow_the_eager_run(store, caplog, fresh_points):
+    changes = {"refresh_cells_every": 12, "extend_weights_every": 12, "bootstrap_steps": 15, "graph": "auto", "workers": 0}
+    changes |= {"fresh_points": fresh_points, "device": torch.device("cuda:0")}
+    one, other = (trainer_for(store, grids_config(), **changes) for _ in range(2))
+    with caplog.at_level(logging.DEBUG, "snarfcli.training.graphs"):
+        losses = advance_to(one, 40)
+    assert sum(record.message.startswith("captured a step") for record in caplog.records) >= 4
+    assert one._ahead is not None
+    assert losses == pytest.approx(advance_to(eager(other), 40), rel=1e-3)  # atomics add in another order in every run
 
 
 def test_fresh_points_are_staged_for_static_steps(store):

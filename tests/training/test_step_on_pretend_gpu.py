@@ -129,6 +129,10 @@ RUNS = """
     trainer.finished_avatar()
     assert trainer.validate()["iou_bbox"] >= 0
 
+    in_pytorch = replace(plain, search=replace(plain.search, backend="reference"))
+    store = SampleStore.open(sys.argv[1], "builtin", "toy")
+    assert Trainer(new_avatar(store, in_pytorch), store, config, 0, CUDA)._ahead is None
+
     class Full:
         def __init__(self, *arguments, **options): ...
         def __enter__(self): raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
@@ -160,4 +164,6 @@ def test_captured_steps_are_those_of_the_eager_run(samples):
     assert len(captured) == 4
     assert (report["fresh"].mixing, report["fresh"].copies) == ([], [])
     assert all("Event.synchronize" in wait for wait in report["fresh"].waits)  # for the copy of three steps before
+    why = "the search in PyTorch waits for the GPU (search.backend=reference)"
+    assert lines.count(f"the training step is not captured in a CUDA graph: {why}") == 1
     assert lines.count("steps are not captured in a CUDA graph from here on: there is not enough memory on the GPU") == 1

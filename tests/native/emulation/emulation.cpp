@@ -5,6 +5,7 @@
 #include "candidates.cu"
 #include "complete.cu"
 #include "draws.cu"
+#include "encoding.cu"
 #include "gather.cu"
 #include "implicit.cu"
 #include "optimizer.cu"
@@ -28,6 +29,10 @@ const NamedKernel<const Search<Number>> search_kernels[] = {
 };
 const NamedKernel<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
 const NamedKernel<const DrawTask> draw_kernels[] = {{"draw_bits", draw_bits}};
+const NamedKernel<const Encoding> encoding_kernels[] = {
+    {"encode_points", encode_points},
+    {"encode_backward", encode_backward},
+};
 const NamedKernel<const AdamLaunch> optimizer_kernels[] = {
     {"check_gradients", check_gradients},
     {"update_parameters", update_parameters},
@@ -40,9 +45,11 @@ extern "C" bool emulate(const char* name, const void* arguments, unsigned x, uns
   return run_named(search_kernels, name, arguments, x, y, threads) ||
          run_named(backward_kernels, name, arguments, x, y, threads) ||
          run_named(draw_kernels, name, arguments, x, y, threads) ||
+         run_named(encoding_kernels, name, arguments, x, y, threads) ||
          run_named(optimizer_kernels, name, arguments, x, y, threads);
 }
 extern "C" size_t search_bytes() { return sizeof(Search<Number>); }
 extern "C" size_t backward_bytes() { return sizeof(Backward<Number>); }
+extern "C" size_t encoding_bytes() { return sizeof(Encoding); }
 extern "C" size_t optimizer_bytes() { return sizeof(AdamLaunch); }
 extern "C" size_t optimizer_task_bytes() { return sizeof(snarf::AdamTask); }

@@ -5,12 +5,20 @@ from __future__ import annotations
 import pytest
 from pretend_gpu.run import Report, run_on_pretend_gpu
 
-KERNELS = {"encode": 1, "encode with gradients": 1 + 2}
+KERNELS = {
+    "encode": 1,
+    "encode with gradients": 1 + 2,
+    "distance": 1,
+    "distance with gradients": 1 + 1,
+    "variation": 3,
+    "variation with gradients": 3 + 1,
+}
 CODE = """
 import torch
 from encoding_arrays import encoding_arrays
 from pretend_gpu.device import CUDA, watch
-from snarfcli.networks import run_encoding
+from snarfcli.deformer.variation import variation
+from snarfcli.networks import run_encoding, run_segment_distance
 
 def compare(name, function, given):
     \"\"\"Compare results on the device and on the CPU, also those of a graph.\"\"\"
@@ -28,16 +36,21 @@ def compare(name, function, given):
             assert one.device == CUDA and one.shape == other.shape
             torch.testing.assert_close(one.detach().cpu(), other.detach(), rtol=1e-4, atol=1e-4)
 
-def encode(*given):
-    return [run_encoding(*given)]
+def compare_with_gradients(name, function, given, wants):
+    def with_gradients(*arguments):
+        arguments = list(arguments)
+        for index in wants:
+            arguments[index] = arguments[index].detach().requires_grad_()
+        result = function(*arguments)
+        return [result, *torch.autograd.grad(result, [arguments[index] for index in wants], result.detach())]
 
-def encode_with_gradients(points, frequencies, table, *rest):
-    points, table = points.detach().requires_grad_(), table.detach().requires_grad_()
-    encoded = run_encoding(points, frequencies, table, *rest)
-    return [encoded, *torch.autograd.grad(encoded, [points, table], encoded.detach())]
+    compare(name, lambda *arguments: [function(*arguments)], given)
+    compare(f"{name} with gradients", with_gradients, given)
 
-compare("encode", encode, encoding_arrays(40))
-compare("encode with gradients", encode_with_gradients, encoding_arrays(40))
+compare_with_gradients("encode", run_encoding, encoding_arrays(40), [0, 2])
+compare_with_gradients("distance", run_segment_distance, [torch.rand(40, 3), torch.rand(5, 2, 3)], [0])
+weights, used = torch.rand(4, 5, 6, 3), torch.rand(4, 5, 6) < 0.7
+compare_with_gradients("variation", lambda *given: variation(*given)[0], [weights, torch.tensor([0.1, 0.2, 0.3]), used], [0])
 """
 
 

@@ -10,6 +10,8 @@
 #include "implicit.cu"
 #include "optimizer.cu"
 #include "parts.cu"
+#include "segments.cu"
+#include "variation.cu"
 
 namespace {
 
@@ -37,6 +39,12 @@ const NamedKernel<const AdamLaunch> optimizer_kernels[] = {
     {"check_gradients", check_gradients},
     {"update_parameters", update_parameters},
 };
+const NamedKernel<const SegmentDistance> segment_kernels[] = {{"measure_distances", measure_distances}};
+const NamedKernel<const Variation> variation_kernels[] = {
+    {"count_pairs", count_pairs},
+    {"measure_changes", measure_changes},
+    {"sum_changes", sum_changes},
+};
 
 }  // namespace
 
@@ -46,10 +54,14 @@ extern "C" bool emulate(const char* name, const void* arguments, unsigned x, uns
          run_named(backward_kernels, name, arguments, x, y, threads) ||
          run_named(draw_kernels, name, arguments, x, y, threads) ||
          run_named(encoding_kernels, name, arguments, x, y, threads) ||
-         run_named(optimizer_kernels, name, arguments, x, y, threads);
+         run_named(optimizer_kernels, name, arguments, x, y, threads) ||
+         run_named(segment_kernels, name, arguments, x, y, threads) ||
+         run_named(variation_kernels, name, arguments, x, y, threads);
 }
 extern "C" size_t search_bytes() { return sizeof(Search<Number>); }
 extern "C" size_t backward_bytes() { return sizeof(Backward<Number>); }
 extern "C" size_t encoding_bytes() { return sizeof(Encoding); }
 extern "C" size_t optimizer_bytes() { return sizeof(AdamLaunch); }
 extern "C" size_t optimizer_task_bytes() { return sizeof(snarf::AdamTask); }
+extern "C" size_t segment_bytes() { return sizeof(SegmentDistance); }
+extern "C" size_t variation_bytes() { return sizeof(Variation); }

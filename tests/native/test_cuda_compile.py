@@ -19,6 +19,7 @@ SOURCES = (
     "encoding",
     "gather",
     "implicit",
+    "interpolate",
     "network",
     "optimizer",
     "parts",

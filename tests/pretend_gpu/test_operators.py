@@ -10,6 +10,7 @@ KERNELS = {
     "encode with gradients": 1 + 2,
     "distance": 1,
     "distance with gradients": 1 + 1,
+    "interpolation": 1,
     "variation": 3,
     "variation with gradients": 3 + 1,
 }
@@ -17,6 +18,7 @@ CODE = """
 import torch
 from encoding_arrays import encoding_arrays
 from pretend_gpu.device import CUDA, watch
+from snarfcli.deformer.trilinear import interpolate_nodes
 from snarfcli.deformer.variation import variation
 from snarfcli.networks import run_encoding, run_segment_distance
 
@@ -49,6 +51,8 @@ def compare_with_gradients(name, function, given, wants):
 
 compare_with_gradients("encode", run_encoding, encoding_arrays(40), [0, 2])
 compare_with_gradients("distance", run_segment_distance, [torch.rand(40, 3), torch.rand(5, 2, 3)], [0])
+box = [-torch.ones(3), torch.ones(3)]
+compare("interpolation", lambda *given: [interpolate_nodes(*given)], [torch.rand(4, 5, 6, 3), torch.randn(40, 3), *box])
 weights, used = torch.rand(4, 5, 6, 3), torch.rand(4, 5, 6) < 0.7
 compare_with_gradients("variation", lambda *given: variation(*given)[0], [weights, torch.tensor([0.1, 0.2, 0.3]), used], [0])
 """

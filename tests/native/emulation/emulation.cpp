@@ -8,6 +8,7 @@
 #include "encoding.cu"
 #include "gather.cu"
 #include "implicit.cu"
+#include "interpolate.cu"
 #include "optimizer.cu"
 #include "parts.cu"
 #include "segments.cu"
@@ -35,6 +36,7 @@ const NamedKernel<const Encoding> encoding_kernels[] = {
     {"encode_points", encode_points},
     {"encode_backward", encode_backward},
 };
+const NamedKernel<const Interpolation<Number>> interpolation_kernels[] = {{"interpolate_values", interpolate_values}};
 const NamedKernel<const AdamLaunch> optimizer_kernels[] = {
     {"check_gradients", check_gradients},
     {"update_parameters", update_parameters},
@@ -54,6 +56,7 @@ extern "C" bool emulate(const char* name, const void* arguments, unsigned x, uns
          run_named(backward_kernels, name, arguments, x, y, threads) ||
          run_named(draw_kernels, name, arguments, x, y, threads) ||
          run_named(encoding_kernels, name, arguments, x, y, threads) ||
+         run_named(interpolation_kernels, name, arguments, x, y, threads) ||
          run_named(optimizer_kernels, name, arguments, x, y, threads) ||
          run_named(segment_kernels, name, arguments, x, y, threads) ||
          run_named(variation_kernels, name, arguments, x, y, threads);
@@ -61,6 +64,7 @@ extern "C" bool emulate(const char* name, const void* arguments, unsigned x, uns
 extern "C" size_t search_bytes() { return sizeof(Search<Number>); }
 extern "C" size_t backward_bytes() { return sizeof(Backward<Number>); }
 extern "C" size_t encoding_bytes() { return sizeof(Encoding); }
+extern "C" size_t interpolation_bytes() { return sizeof(Interpolation<Number>); }
 extern "C" size_t optimizer_bytes() { return sizeof(AdamLaunch); }
 extern "C" size_t optimizer_task_bytes() { return sizeof(snarf::AdamTask); }
 extern "C" size_t segment_bytes() { return sizeof(SegmentDistance); }

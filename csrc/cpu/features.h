@@ -6,6 +6,7 @@
 #include "blocks.h"
 #include "network_task.h"
 #include "snarf/places.h"
+#include "snarf/slope.h"
 
 namespace snarf {
 namespace SNARF_ISA {
@@ -76,7 +77,7 @@ SNARF_HD void spread(float* v_table, int count, const Place& place, const float*
 SNARF_HD void add_slope(const float* table, int count, const FeatureLevel& level, const Place& place, const float* given,
                         float* total) {
   if (!place.is_inside) return;
-  float along[8] = {};  // the gradient's product with each corner's features, which is interpolated as they are
+  float along[8] = {};
   for_blocks(count, [&](int first, auto features) {
     constexpr int F = decltype(features)::value;
     float gradient[F];
@@ -89,17 +90,7 @@ SNARF_HD void add_slope(const float* table, int count, const FeatureLevel& level
       for (int f = 0; f < F; ++f) along[k] += product[f];
     }
   });
-  const float x = place.local[0], y = place.local[1], z = place.local[2];
-  float edge[4], rise[4];  // between and along the edges in x
-  for (int k = 0; k < 4; ++k) {
-    rise[k] = along[2 * k + 1] - along[2 * k];
-    edge[k] = along[2 * k] + x * rise[k];
-  }
-  const float low = rise[0] + y * (rise[1] - rise[0]), high = rise[2] + y * (rise[3] - rise[2]);
-  const float front = edge[1] - edge[0], back = edge[3] - edge[2];
-  total[0] += level.per_metre[0] * (low + z * (high - low));
-  total[1] += level.per_metre[1] * (front + z * (back - front));
-  total[2] += level.per_metre[2] * (edge[2] + y * back - edge[0] - y * front);
+  add_slope(level, place, along, total);
 }
 
 }  // namespace

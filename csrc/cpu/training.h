@@ -13,6 +13,7 @@
 #include "feature_level.h"
 #include "snarf/adam.h"
 #include "snarf/api.h"
+#include "snarf/variation.h"
 #include "team.h"
 #include "training_task.h"
 
@@ -327,8 +328,7 @@ inline double total_variation(const snarf_variation& given, float* gradient) {
     pairs[1] += n / width % height + 1 < height && is_used(n + width);
     pairs[2] += n / layer + 1 < depth && is_used(n + layer);
   }
-  for (int axis = 0; axis < 3; ++axis)
-    task.scale[axis] = float(1 / (given.size[axis] * double(std::max<int64_t>(1, pairs[axis]))));
+  for (int axis = 0; axis < 3; ++axis) task.scale[axis] = SNARF_ISA::change_scale(given.size[axis], pairs[axis]);
   std::vector<double> totals(size_t(depth), 0.0);
   task.totals = totals.data();
   const int threads = int(std::max<int64_t>(1, std::min<int64_t>({given.threads, depth, layer * depth / 1024})));

@@ -1,9 +1,10 @@
-// The change of skinning weights from node to node (total_variation in snarfcli/deformer/variation.py).
+// The change of skinning weights from node to node (snarf/variation.h), layer by layer.
 #pragma once
 
 #include <math.h>
 #include <string.h>
 
+#include "snarf/variation.h"
 #include "training_task.h"
 
 namespace snarf {
@@ -29,11 +30,7 @@ void variation(const VariationTask& task, int64_t first, int64_t last) {
           const float* __restrict const there = task.weights + other * count;
           const float scale = task.scale[axis];
           float sum = 0;
-          for (int64_t j = 0; j < count; ++j) {
-            const float change = here[j] - there[j];
-            gradient[j] += change > 0.f ? scale : change < 0.f ? -scale : 0.f;
-            sum += fabsf(change);
-          }
+          for (int64_t j = 0; j < count; ++j) sum += add_change(here[j], there[j], scale, gradient[j]);
           if (side > 0) total += double(scale) * double(sum);
         }
     }

@@ -6,9 +6,11 @@ import torch
 from torch import Tensor
 
 from snarfcli.deformer.grid import CanonicalGrid, cell_corners, locate, trilinear_weights
+from snarfcli.native import cuda_interpolation
+from snarfcli.native.backend import choose_backend
 from snarfcli.networks import MAX_FEATURES, run_encoding
 
-__all__ = ["between_corners", "forward_jacobian", "interpolate", "trilinear_transforms"]
+__all__ = ["between_corners", "forward_jacobian", "interpolate", "interpolate_nodes", "trilinear_transforms"]
 
 _INSIDE = 5e-5  # share of a cell; float32 places points in a grid of 64 cells to 2e-5
 
@@ -31,10 +33,41 @@ def interpolate(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:
         tables = values.reshape(-1, values.shape[-1]).split(MAX_FEATURES, dim=1)
         parts = [run_encoding(inside, none, table, rows, [width, height, depth], box)[:, 3:] for table in tables]
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+    if not torch.is_grad_enabled() and points.device.type == "cuda" and _has_kernel(values, points, grid.lower, grid.upper):
+        return interpolate_nodes(values, points, grid.lower, grid.upper)
+    return _interpolate_reference(values, points, grid)
+
+
+def _interpolate_reference(values: Tensor, points: Tensor, grid: CanonicalGrid) -> Tensor:
+    shape = values.shape[:3]
     cell, local = locate(points, grid, shape)
     corners = cell_corners(cell, shape)
     phi = trilinear_weights(local.clamp(0, 1))
     return (phi[..., None] * values.reshape(-1, values.shape[-1])[corners]).sum(-2)
+
+
+@torch.library.custom_op("snarf::interpolate_nodes", mutates_args=())
+def interpolate_nodes(values: Tensor, points: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Interpolate as `interpolate` does, in the box with the corners `lower` and `upper` [3]; without gradients."""
+    return _interpolate_reference(values, points, CanonicalGrid(lower, upper, checked=True))
+
+
+@interpolate_nodes.register_kernel("cuda")
+def _(values, points, lower, upper):
+    if _has_kernel(values, points, lower, upper):
+        return cuda_interpolation.interpolate(values, points, lower, upper)
+    return _interpolate_reference(values, points, CanonicalGrid(lower, upper, checked=True))
+
+
+@interpolate_nodes.register_fake
+def _(values, points, lower, upper):
+    return values.new_empty(len(points), values.shape[3])
+
+
+def _has_kernel(values: Tensor, *others: Tensor) -> bool:
+    """Return whether there is a CUDA kernel for numbers of these types."""
+    is_one_type = all(values.dtype == other.dtype for other in others) and values.dtype in (torch.float32, torch.float64)
+    return is_one_type and choose_backend("auto", "cuda") == "native"
 
 
 def forward_jacobian(corner_transforms: Tensor, local: Tensor, origin: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
 from snarfcli.deformer.grid import CanonicalGrid
-from snarfcli.native import cpu
+from snarfcli.native import cpu, cuda_variation
 from snarfcli.native.backend import choose_backend
 
 __all__ = ["total_variation", "variation", "variation_reference"]
+
+_KERNELS = {"cpu": cpu.total_variation, "cuda": cuda_variation.total_variation}  # by the type of device
 
 
 def total_variation(weights: Tensor, grid: CanonicalGrid, used: Tensor | None = None) -> Tensor:
@@ -27,13 +27,18 @@ def total_variation(weights: Tensor, grid: CanonicalGrid, used: Tensor | None = 
     Source: the regulariser that Fast-SNARF Sec. 4.2 mentions; the norm is our choice.
     """
     size = grid.cell_size(weights.shape[:3])
-    is_native = weights.device.type == "cpu" and weights.dtype == torch.float32
-    if is_native and choose_backend("auto") == "native":
-        return variation(weights, size.tolist(), used)[0]
+    if _has_kernel(weights, size):
+        return variation(weights, size, used)[0]
     return variation_reference(weights, size, used)
 
 
-def variation_reference(weights: Tensor, size: Sequence[float] | Tensor, used: Tensor | None) -> Tensor:
+def _has_kernel(weights: Tensor, size: Tensor) -> bool:
+    """Return whether native kernels take these arguments on this device."""
+    kind = weights.device.type
+    return weights.dtype == size.dtype == torch.float32 and kind in _KERNELS and choose_backend("auto", kind) == "native"
+
+
+def variation_reference(weights: Tensor, size: Tensor, used: Tensor | None) -> Tensor:
     """The readable version of `variation`, without its gradient."""
     total = weights.new_zeros(())
     for axis in range(3):  # z, y, x
@@ -50,27 +55,26 @@ def variation_reference(weights: Tensor, size: Sequence[float] | Tensor, used: T
 
 
 @torch.library.custom_op("snarf::variation", mutates_args=())
-def variation(weights: Tensor, size: Sequence[float], used: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the total variation of weights [D, H, W, J] on cells with sides `size` (x, y, z), [], and its gradient.
+def variation(weights: Tensor, size: Tensor, used: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the total variation of weights [D, H, W, J], [], and its gradient.
 
     Args:
         weights: [D, H, W, J].
-        size: three numbers, metres.
+        size: [3], sides of a cell along x, y, z, metres.
         used: [D, H, W], bool; only pairs of these nodes count. None for all.
     """
     return _with_gradient(weights, size, used)
 
 
-def _with_gradient(weights: Tensor, size: Sequence[float], used: Tensor | None) -> tuple[Tensor, Tensor]:
+def _with_gradient(weights: Tensor, size: Tensor, used: Tensor | None) -> tuple[Tensor, Tensor]:
     total, back, *_ = torch.func.vjp(lambda given: variation_reference(given, size, used), weights)
     return total, back(torch.ones_like(total))[0]
 
 
-@variation.register_kernel("cpu")
+@variation.register_kernel(["cpu", "cuda"])
 def _(weights, size, used):
-    if weights.dtype == torch.float32 and choose_backend("auto") == "native":
-        return cpu.total_variation(weights, size, used)
-    return _with_gradient(weights, size, used)
+    run = _KERNELS[weights.device.type] if _has_kernel(weights, size) else _with_gradient
+    return run(weights, size, used)
 
 
 @variation.register_fake

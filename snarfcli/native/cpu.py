@@ -270,7 +270,7 @@ def implicit_backward(
     return v_points, v_transforms
 
 
-def total_variation(weights: Tensor, size: Sequence[float], used: Tensor | None) -> tuple[Tensor, Tensor]:
+def total_variation(weights: Tensor, size: Tensor, used: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the change of weights [D, H, W, J] from node to node, [], and its gradient; see `variation.total_variation`."""
     weights, used = weights.contiguous(), None if used is None else used.contiguous()
     depth, height, width, count = weights.shape
@@ -278,7 +278,7 @@ def total_variation(weights: Tensor, size: Sequence[float], used: Tensor | None)
         raise ValueError(f"used: wanted bool {list(weights.shape[:3])}, got {used.dtype} {list(used.shape)}")
     nodes = (c_int32 * 3)(width, height, depth)
     place = None if used is None else used.data_ptr()
-    given = _Variation(weights.data_ptr(), place, nodes, count, (c_double * 3)(*size), torch.get_num_threads())
+    given = _Variation(weights.data_ptr(), place, nodes, count, (c_double * 3)(*size.tolist()), torch.get_num_threads())
     total, gradient = c_double(), torch.empty_like(weights)
     code = _library().snarf_total_variation(byref(given), byref(total), c_void_p(gradient.data_ptr()))
     _raise_for(code, "the loss on the skinning weights ran out of memory; give a smaller skinning.resolution")

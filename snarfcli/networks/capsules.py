@@ -5,22 +5,29 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from snarfcli.native import cpu_networks
+from snarfcli.native import cpu_networks, cuda_segments
 from snarfcli.native.backend import choose_backend
 from snarfcli.segments import distance_to_segments
 
 __all__ = ["nearest_segment", "run_segment_distance"]
 
+_KERNELS = {"cpu": cpu_networks.segment_distances, "cuda": cuda_segments.segment_distances}  # by the type of device
+
 
 def run_segment_distance(points: Tensor, segments: Tensor) -> Tensor:
     """Return the distance of points [N, 3] to the nearest of the segments [S, 2, 3], [N], metres, with gradients by the points.
 
-    By the native operator in float32 on a CPU, else by PyTorch.
+    By the native operator in float32 on a CPU or a GPU, else by PyTorch.
     """
-    is_native = points.device.type == "cpu" and points.dtype == segments.dtype == torch.float32 and not segments.requires_grad
-    if is_native and choose_backend("auto") == "native":
+    if not segments.requires_grad and _has_kernel(points, segments):
         return nearest_segment(points, segments)[0]
     return distance_to_segments(points, segments)
+
+
+def _has_kernel(points: Tensor, segments: Tensor) -> bool:
+    """Return whether native kernels take these arguments on this device."""
+    kind = points.device.type
+    return points.dtype == segments.dtype == torch.float32 and kind in _KERNELS and choose_backend("auto", kind) == "native"
 
 
 @torch.library.custom_op("snarf::nearest_segment", mutates_args=())
@@ -34,11 +41,10 @@ def _reference(points: Tensor, segments: Tensor) -> tuple[Tensor, Tensor]:
     return distance, back(torch.ones_like(distance))[0]
 
 
-@nearest_segment.register_kernel("cpu")
+@nearest_segment.register_kernel(["cpu", "cuda"])
 def _(points, segments):
-    if points.dtype == torch.float32 and choose_backend("auto") == "native":
-        return cpu_networks.segment_distances(points, segments)
-    return _reference(points, segments)
+    run = _KERNELS[points.device.type] if _has_kernel(points, segments) else _reference
+    return run(points, segments)
 
 
 @nearest_segment.register_fake

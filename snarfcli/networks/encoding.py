@@ -1,7 +1,7 @@
 """Points as coordinates, waves and features of grids: a torch.library operator.
 
-On a CPU the native library evaluates it, forward and backward (csrc/cpu/training.cpp), in float32; everywhere else, and in
-other dtypes, the readable version does.
+In float32, native kernels evaluate it, forward and backward, on a CPU (csrc/cpu/training.cpp) and on a GPU
+(csrc/cuda/encoding.cu); everywhere else, and in other dtypes, the readable version does.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ import torch
 from torch import Tensor
 
 from snarfcli.constants import constant
-from snarfcli.native import cpu_networks
+from snarfcli.native import cpu_networks, cuda_encoding
 from snarfcli.native.backend import choose_backend
 
 __all__ = ["MAX_FEATURES", "encode", "encode_reference", "run_encoding"]
 
 MAX_FEATURES = 64
 """Maximum number of features per node that the native operator takes (csrc/cpu/network_task.h)."""
+
+_KERNELS = {"cpu": cpu_networks, "cuda": cuda_encoding}  # by the type of device
 
 
 def encode_reference(
@@ -72,16 +74,22 @@ def run_encoding(
     nodes: Sequence[int] = (),
     boxes: Sequence[float] = (),
 ) -> Tensor:
-    """Encode points with gradients: by the native operator in float32 on a CPU, else by PyTorch.
+    """Encode points with gradients: by the native operator in float32 on a CPU or a GPU, else by PyTorch.
 
     Arguments and result: as those of `encode`; without a table there are no grids.
     """
     table = points.new_empty(0, 1) if table is None else table
     rows = torch.empty(0, dtype=torch.int32, device=points.device) if rows is None else rows
-    is_native = points.device.type == "cpu" and points.dtype == table.dtype == torch.float32
-    is_native &= table.shape[1] <= MAX_FEATURES
-    run = encode if is_native and choose_backend("auto") == "native" else encode_reference
+    run = encode if _has_kernel(points, table, nodes) else encode_reference
     return run(points, frequencies, table, rows, list(nodes), list(boxes))
+
+
+def _has_kernel(points: Tensor, table: Tensor, nodes: Sequence[int]) -> bool:
+    """Return whether native kernels take these arguments on this device."""
+    kind = points.device.type
+    takes = points.dtype == table.dtype == torch.float32 and kind in _KERNELS and table.shape[1] <= MAX_FEATURES
+    takes &= kind != "cuda" or len(nodes) <= 3 * cuda_encoding.MAX_LEVELS
+    return takes and choose_backend("auto", kind) == "native"
 
 
 @torch.library.custom_op("snarf::encode", mutates_args=())
@@ -106,11 +114,10 @@ def encode(
     return encode_reference(points, frequencies, table, rows, nodes, boxes)
 
 
-@encode.register_kernel("cpu")
+@encode.register_kernel(["cpu", "cuda"])
 def _(points, frequencies, table, rows, nodes, boxes):
-    if points.dtype == torch.float32 and choose_backend("auto") == "native":
-        return cpu_networks.encode(points, frequencies, table, rows, nodes, boxes)
-    return encode_reference(points, frequencies, table, rows, nodes, boxes)
+    run = _KERNELS[points.device.type].encode if _has_kernel(points, table, nodes) else encode_reference
+    return run(points, frequencies, table, rows, nodes, boxes)
 
 
 @encode.register_fake
@@ -137,17 +144,19 @@ def encode_backward(
     wants_points: bool,
     wants_table: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Return the gradients of a loss by the points and by the features (empty where not wanted), from that by the encoding."""
+    """Return the gradients of a loss by the points and by the features (empty where not wanted), from that by the encoding.
+
+    The first is deterministic. On a GPU the second is summed by float atomics in an order that varies, and so do its last bits.
+    """
     return _encode_backward_reference(gradient, points, frequencies, table, rows, nodes, boxes, (wants_points, wants_table))
 
 
-@encode_backward.register_kernel("cpu")
+@encode_backward.register_kernel(["cpu", "cuda"])
 def _(gradient, encoded, points, frequencies, table, rows, nodes, boxes, wants_points, wants_table):
-    if points.dtype == torch.float32 and choose_backend("auto") == "native":
-        return cpu_networks.encode_backward(
-            gradient, encoded, points, frequencies, table, rows, nodes, boxes, wants_points, wants_table
-        )
-    return _encode_backward_reference(gradient, points, frequencies, table, rows, nodes, boxes, (wants_points, wants_table))
+    given, wants = (points, frequencies, table, rows, nodes, boxes), (wants_points, wants_table)
+    if _has_kernel(points, table, nodes):
+        return _KERNELS[points.device.type].encode_backward(gradient, encoded, *given, *wants)
+    return _encode_backward_reference(gradient, *given, wants)
 
 
 @encode_backward.register_fake

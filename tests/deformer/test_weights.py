@@ -126,7 +126,7 @@ def test_native_variation_equals_the_reference(shape, share):
     generator = torch.Generator().manual_seed(0)
     weights = torch.rand(shape, generator=generator)
     used = None if share is None else torch.rand(shape[:3], generator=generator) < share
-    size = [0.1, 0.2, 0.05]
+    size = torch.tensor([0.1, 0.2, 0.05])
     given = weights.double().requires_grad_()
     wanted = variation_reference(given, size, used)
     results = []
@@ -145,8 +145,9 @@ def test_native_variation_equals_the_reference(shape, share):
 def test_variation_is_an_operator():
     weights = torch.rand(3, 4, 5, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
     used = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(1)) < 0.7
-    assert torch.autograd.gradcheck(lambda given: variation(given, [0.1, 0.2, 0.3], used)[0], [weights])
-    torch.library.opcheck(variation, (weights.detach().float(), [0.1, 0.2, 0.3], used))
+    size = torch.tensor([0.1, 0.2, 0.3])
+    assert torch.autograd.gradcheck(lambda given: variation(given, size, used)[0], [weights])
+    torch.library.opcheck(variation, (weights.detach().float(), size, used))
 
 
 @pytest.mark.parametrize("softmax", [PlainSoftmax(4), HierarchicalSoftmax(PARENTS)])

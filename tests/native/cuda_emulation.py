@@ -95,7 +95,7 @@ def _build(dtype: torch.dtype, program: str) -> ctypes.CDLL:
             raise RuntimeError(f"{' '.join(command)}\n{built.stderr}")
         loaded = ctypes.CDLL(str(library), mode=ctypes.RTLD_LOCAL)
     loaded.emulate.restype = ctypes.c_bool
-    structures = ("search", "backward", "optimizer", "optimizer_task")
+    structures = ("search", "backward", "encoding", "interpolation", "optimizer", "optimizer_task", "segment", "variation")
     for structure in structures if program == "emulation" else ("packing", "evaluation"):
         getattr(loaded, f"{structure}_bytes").restype = ctypes.c_size_t
     loaded.work_of_blocks.restype = ctypes.POINTER(ctypes.c_longlong)

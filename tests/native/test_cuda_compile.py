@@ -11,7 +11,21 @@ import torch
 from snarfcli.native import cuda, cuda_compile
 from snarfcli.native.kernel_cache import read_cached
 
-SOURCES = ("broyden", "candidates", "complete", "draws", "gather", "implicit", "network", "optimizer", "parts")
+SOURCES = (
+    "broyden",
+    "candidates",
+    "complete",
+    "draws",
+    "encoding",
+    "gather",
+    "implicit",
+    "interpolate",
+    "network",
+    "optimizer",
+    "parts",
+    "segments",
+    "variation",
+)
 FLOAT32_ONLY = ("network",)  # whatever the type of numbers of the others
 
 

@@ -4,29 +4,17 @@ from __future__ import annotations
 
 import pytest
 import torch
+from encoding_arrays import encoding_arrays
 
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.trilinear import interpolate
 from snarfcli.networks.encoding import encode, encode_backward, encode_reference
-from snarfcli.shape.features import FeatureGrids
-
-LOWER, UPPER = torch.tensor([-1.0, -1.2, -0.3]), torch.tensor([1.0, 0.9, 0.4])
-
-
-def made(count: int, features: int = 4, cells=(0.3, 0.11), frequencies=(2.0, 16.0), dtype=torch.float32, seed=0):
-    """Return the arguments of an encoding whose grids are covered in part, at points inside and a little outside of the box."""
-    torch.manual_seed(seed)
-    grids = FeatureGrids(LOWER, UPPER, cells, features)
-    grids.cover(torch.rand(4, 9, 8) > 0.5)
-    points = (torch.rand(count, 3) * (UPPER - LOWER) * 1.1 + LOWER - 0.05).to(dtype)
-    table = torch.randn(len(grids.table), features).to(dtype)
-    return points, torch.tensor(frequencies, dtype=dtype), table, grids.rows, grids.nodes, grids.boxes
 
 
 @pytest.mark.parametrize("features", [1, 2, 3, 4])
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 700])
 def test_native_values_and_gradients_are_those_of_the_reference(count, features):
-    points, frequencies, table, *grids = made(count, features)
+    points, frequencies, table, *grids = encoding_arrays(count, features)
     points.requires_grad_(), table.requires_grad_()
     out = encode(points, frequencies, table, *grids)
     wide = [t.detach().double().requires_grad_() for t in (points, table)]
@@ -41,7 +29,7 @@ def test_native_values_and_gradients_are_those_of_the_reference(count, features)
 
 
 def test_one_gradient_alone():
-    points, frequencies, table, *grids = made(50)
+    points, frequencies, table, *grids = encoding_arrays(50)
     both = encode_backward(
         torch.ones(50, 23), encode(points, frequencies, table, *grids), points, frequencies, table, *grids, True, True
     )
@@ -54,7 +42,7 @@ def test_one_gradient_alone():
 
 
 def test_the_result_does_not_depend_on_the_number_of_threads():
-    points, frequencies, table, *grids = made(3000)
+    points, frequencies, table, *grids = encoding_arrays(3000)
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 2, 3):
@@ -68,13 +56,13 @@ def test_the_result_does_not_depend_on_the_number_of_threads():
 
 
 def test_gradients_are_those_of_finite_differences():
-    points, frequencies, table, *grids = made(6, 2, dtype=torch.float64)
+    points, frequencies, table, *grids = encoding_arrays(6, 2, (0.9, 0.5), dtype=torch.float64)
     given = [points.requires_grad_(), table.requires_grad_()]
     assert torch.autograd.gradcheck(lambda p, t: encode(p, frequencies, t, *grids), given)
 
 
 def test_operator_contract():
-    points, frequencies, table, *grids = made(5)
+    points, frequencies, table, *grids = encoding_arrays(5)
     torch.library.opcheck(encode, (points, frequencies, table, *grids))
     torch.library.opcheck(encode, (points.requires_grad_(), frequencies, table.requires_grad_(), *grids))
 
@@ -87,7 +75,7 @@ def test_without_grids_only_waves():
 
 
 def test_outside_of_the_box_there_are_no_features():
-    _, frequencies, table, *grids = made(1)
+    _, frequencies, table, *grids = encoding_arrays(1)
     encoded = encode(torch.tensor([[5.0, 0.0, 0.0], [torch.nan, 0.0, 0.0]]), frequencies, table, *grids)
     assert not encoded[0, 15:].any()
     assert encoded[0].isfinite().all()

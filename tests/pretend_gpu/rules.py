@@ -33,7 +33,7 @@ _READS_VALUES = ("_local_scalar_dense", "equal", "allclose", "is_nonzero", "binc
 _CHECKS_ERRORS = ("_linalg_check_errors", "_linalg_eigh", "_linalg_svd", "linalg_eig", "linalg_lstsq")
 _WAITS = _SIZE_FROM_VALUES + _READS_VALUES + _CHECKS_ERRORS
 
-_OF_OURS = {"complete_search": 11, "broyden_search": 6, "implicit_backward": 3}
+_OF_OURS = {"complete_search": 11, "broyden_search": 6, "implicit_backward": 3, "encode_backward": 2, "variation": 3}
 _KERNELS = {
     "index_put": 7, "index_put_": 6, "_index_put_impl_": 6, "nonzero": 4, "masked_select": 6, "_unique2": 8, "argsort": 3,
     "sort": 3, "cumsum": 2, "bincount": 5, "repeat_interleave": 3, "scatter_reduce": 2, "index_add": 2, "index_copy": 2,

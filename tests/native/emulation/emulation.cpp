@@ -5,10 +5,14 @@
 #include "candidates.cu"
 #include "complete.cu"
 #include "draws.cu"
+#include "encoding.cu"
 #include "gather.cu"
 #include "implicit.cu"
+#include "interpolate.cu"
 #include "optimizer.cu"
 #include "parts.cu"
+#include "segments.cu"
+#include "variation.cu"
 
 namespace {
 
@@ -28,9 +32,20 @@ const NamedKernel<const Search<Number>> search_kernels[] = {
 };
 const NamedKernel<const Backward<Number>> backward_kernels[] = {{"implicit_backward", implicit_backward}};
 const NamedKernel<const DrawTask> draw_kernels[] = {{"draw_bits", draw_bits}};
+const NamedKernel<const Encoding> encoding_kernels[] = {
+    {"encode_points", encode_points},
+    {"encode_backward", encode_backward},
+};
+const NamedKernel<const Interpolation<Number>> interpolation_kernels[] = {{"interpolate_values", interpolate_values}};
 const NamedKernel<const AdamLaunch> optimizer_kernels[] = {
     {"check_gradients", check_gradients},
     {"update_parameters", update_parameters},
+};
+const NamedKernel<const SegmentDistance> segment_kernels[] = {{"measure_distances", measure_distances}};
+const NamedKernel<const Variation> variation_kernels[] = {
+    {"count_pairs", count_pairs},
+    {"measure_changes", measure_changes},
+    {"sum_changes", sum_changes},
 };
 
 }  // namespace
@@ -40,9 +55,17 @@ extern "C" bool emulate(const char* name, const void* arguments, unsigned x, uns
   return run_named(search_kernels, name, arguments, x, y, threads) ||
          run_named(backward_kernels, name, arguments, x, y, threads) ||
          run_named(draw_kernels, name, arguments, x, y, threads) ||
-         run_named(optimizer_kernels, name, arguments, x, y, threads);
+         run_named(encoding_kernels, name, arguments, x, y, threads) ||
+         run_named(interpolation_kernels, name, arguments, x, y, threads) ||
+         run_named(optimizer_kernels, name, arguments, x, y, threads) ||
+         run_named(segment_kernels, name, arguments, x, y, threads) ||
+         run_named(variation_kernels, name, arguments, x, y, threads);
 }
 extern "C" size_t search_bytes() { return sizeof(Search<Number>); }
 extern "C" size_t backward_bytes() { return sizeof(Backward<Number>); }
+extern "C" size_t encoding_bytes() { return sizeof(Encoding); }
+extern "C" size_t interpolation_bytes() { return sizeof(Interpolation<Number>); }
 extern "C" size_t optimizer_bytes() { return sizeof(AdamLaunch); }
 extern "C" size_t optimizer_task_bytes() { return sizeof(snarf::AdamTask); }
+extern "C" size_t segment_bytes() { return sizeof(SegmentDistance); }
+extern "C" size_t variation_bytes() { return sizeof(Variation); }

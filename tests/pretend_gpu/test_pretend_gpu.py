@@ -320,5 +320,5 @@ def test_emulated_kernels_find_what_those_for_the_cpu_find_and_can_be_captured()
     assert report["reference"].kernels > 100  # operators of PyTorch
     for name in ("with a capacity", "replay"):
         assert (report[name].mixing, report[name].waits, report[name].copies) == ([], [], [])
-    assert any(line.startswith("search_tame: snarfcli/") for line in report["with a capacity"].launches)
+    assert any(line.startswith("search_cells: snarfcli/") for line in report["with a capacity"].launches)
     assert [count for line, count in report["replay"].launches.items() if line.startswith("implicit_backward: ")] == [2]

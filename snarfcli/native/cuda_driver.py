@@ -42,7 +42,13 @@ class KernelLauncher(Protocol):
         ...
 
     def launch(
-        self, source: str | Path, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure, shared_bytes: int = 0
+        self,
+        source: str | Path,
+        kernel: str,
+        blocks: tuple[int, int],
+        threads: int,
+        arguments: Structure,
+        shared_bytes: int = 0,
     ) -> None:
         """Run a kernel with one structure as its argument, after all earlier launches.
 
@@ -79,7 +85,13 @@ class Gpu:
         return most
 
     def launch(
-        self, source: str | Path, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure, shared_bytes: int = 0
+        self,
+        source: str | Path,
+        kernel: str,
+        blocks: tuple[int, int],
+        threads: int,
+        arguments: Structure,
+        shared_bytes: int = 0,
     ) -> None:
         function = self.load(source, kernel)
         if shared_bytes > self._granted.get((source, kernel), _ALWAYS_GRANTED_BYTES):

@@ -7,9 +7,9 @@ INSTALLED := $(VENV)/.snarf-installed
 SNARF := $(VENV)/bin/snarf
 SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
-C_FAMILY = $(shell find csrc tests/native tests/pretend_gpu tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
+C_FAMILY = $(shell find csrc benchmarks tests/native tests/pretend_gpu tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
 
-.PHONY: help setup demo test fuzz trust sanitize lint format bench clean
+.PHONY: help setup demo test fuzz trust sanitize lint format bench gpu clean
 
 help:
 	@echo "make setup     install snarf into $(VENV)"
@@ -21,6 +21,7 @@ help:
 	@echo "make lint      check style, format and types of the code"
 	@echo "make format    format the code"
 	@echo "make bench     measure the searches, preprocessing, batches, a training step, evaluation and mesh extraction"
+	@echo "make gpu       check and measure everything that runs on a GPU, in ten minutes after some of preparation on the CPU"
 	@echo "make clean     remove .venv, builds, samples and results"
 
 setup: $(INSTALLED)
@@ -84,6 +85,10 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_surfaces.py
 	$(VENV)/bin/python benchmarks/bm_loose_pieces.py
 	$(VENV)/bin/python benchmarks/bm_video.py
+
+gpu: $(INSTALLED)
+	$(VENV)/bin/python benchmarks/pack_gpu_check.py
+	$(VENV)/bin/python benchmarks/gpu_check.py
 
 clean:
 	rm -rf .venv build data/processed outputs

@@ -5,6 +5,8 @@ Differences to `search="broyden"` of this package, which cost accuracy: the star
 from before the last step; the thresholds are fixed lengths. All queries and starts go through every step together, with
 `grid_sample` for the look-up; those that have converged or diverged leave.
 
+released_search.cu has the same as CUDA kernels, released_kernels.py runs them.
+
 Source: Fast-SNARF Sec. 3 (Eq. 7-9), Sec. 4.1 and Algorithm 1.
 """
 
@@ -17,16 +19,21 @@ from torch import Tensor
 
 from snarfcli.deformer import CanonicalGrid
 
-__all__ = ["released_search"]
+__all__ = ["CONVERGED_M", "DIVERGED_M", "DUPLICATE_M", "STEPS", "released_search"]
 
-_CONVERGED_M = 1e-4
-_DIVERGED_M = 0.5
-_STEPS = 10
-_DUPLICATE_M = 1e-3  # roots of several starts agree to the convergence threshold times the norm of J^-1
+CONVERGED_M = 1e-4
+DIVERGED_M = 0.5
+STEPS = 10
+DUPLICATE_M = 1e-3  # roots of several starts agree to the convergence threshold times the norm of J^-1
 
 
 def released_search(
-    points: Tensor, bone_transforms: Tensor, skinning_weights: Tensor, grid: CanonicalGrid, init_bones: Sequence[int]
+    points: Tensor,
+    bone_transforms: Tensor,
+    skinning_weights: Tensor,
+    grid: CanonicalGrid,
+    init_bones: Sequence[int],
+    steps: int = STEPS,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Find correspondences as the released code does.
 
@@ -36,12 +43,13 @@ def released_search(
         skinning_weights: [D, H, W, J], at the nodes of the grid.
         grid: box of the nodes.
         init_bones: bones that give a start.
+        steps: maximum number of Broyden steps; 10 in Fast-SNARF, 50 in SNARF.
 
     Returns:
         Canonical points [M, 3], metres; index b * N + n of their queries, ascending, [M]; J^-1 [M, 3, 3].
     """
     parts = [
-        _one_pose(pose_points, transforms, skinning_weights, grid, list(init_bones))
+        _one_pose(pose_points, transforms, skinning_weights, grid, list(init_bones), steps)
         for pose_points, transforms in zip(points, bone_transforms, strict=True)
     ]
     query = torch.cat([part[1] + b * points.shape[1] for b, part in enumerate(parts)])
@@ -49,7 +57,7 @@ def released_search(
 
 
 @torch.no_grad()
-def _one_pose(points: Tensor, transforms: Tensor, weights: Tensor, grid: CanonicalGrid, bones: list[int]):
+def _one_pose(points: Tensor, transforms: Tensor, weights: Tensor, grid: CanonicalGrid, bones: list[int], steps: int):
     nodes = weights.reshape(-1, weights.shape[-1]) @ transforms[:, :3].reshape(-1, 12)
     volume = nodes.reshape(*weights.shape[:3], 12).permute(3, 0, 1, 2)[None].contiguous()
 
@@ -65,20 +73,20 @@ def _one_pose(points: Tensor, transforms: Tensor, weights: Tensor, grid: Canonic
     inverse_bones = torch.linalg.inv(transforms[bones])
     starts = torch.einsum("jrc,nc->njr", inverse_bones[:, :3, :3], points) + inverse_bones[:, :3, 3]
     x, target = starts.reshape(-1, 3), points[:, None].expand(-1, len(bones), -1).reshape(-1, 3)
-    start = torch.arange(len(x))
+    start = torch.arange(len(x), device=x.device)
     error, rows = residual(x, target)
     inverse = rows[:, :, :3].transpose(1, 2).contiguous()
-    canonical, jacobian_inverse = torch.zeros_like(x), torch.zeros(len(x), 3, 3)
-    valid = torch.zeros(len(x), dtype=torch.bool)
-    for _ in range(_STEPS):
+    canonical, jacobian_inverse = torch.zeros_like(x), x.new_zeros(len(x), 3, 3)
+    valid = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    for _ in range(steps):
         step = -(inverse @ error[:, :, None])
         x = x + step[:, :, 0]
         moved, _ = residual(x, target)
         distance = moved.norm(dim=1)
-        done = distance < _CONVERGED_M
+        done = distance < CONVERGED_M
         finished = start[done]
         canonical[finished], jacobian_inverse[finished], valid[finished] = x[done], inverse[done], True
-        going = (~done & (distance < _DIVERGED_M)).nonzero()[:, 0]
+        going = (~done & (distance < DIVERGED_M)).nonzero()[:, 0]
         if not len(going):
             break
         change = (moved - error)[going, :, None]
@@ -89,7 +97,7 @@ def _one_pose(points: Tensor, transforms: Tensor, weights: Tensor, grid: Canonic
         inverse = inverse + update.nan_to_num(0, 0, 0)
     canonical, valid = canonical.reshape(-1, len(bones), 3), valid.reshape(-1, len(bones))
     for i in range(1, len(bones)):
-        near = (canonical[:, :i] - canonical[:, i : i + 1]).norm(dim=-1) < _DUPLICATE_M
+        near = (canonical[:, :i] - canonical[:, i : i + 1]).norm(dim=-1) < DUPLICATE_M
         valid[:, i] &= ~(near & valid[:, :i]).any(1)
     query, slot = valid.nonzero(as_tuple=True)
     return canonical[query, slot], query, jacobian_inverse.reshape(-1, len(bones), 3, 3)[query, slot]

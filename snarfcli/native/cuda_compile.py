@@ -18,11 +18,11 @@ _OPTIONS = ("--std=c++17", "--device-as-default-execution-space")
 _NUMBERS = {torch.float32: "float", torch.float64: "double"}
 
 
-def load_kernels(source: str, dtype: torch.dtype, architecture: str) -> bytes:
+def load_kernels(source: str | Path, dtype: torch.dtype, architecture: str) -> bytes:
     """Return the machine code of the kernels in `source`, from the cache on disk or freshly compiled.
 
     Args:
-        source: file in csrc/cuda without its ending.
+        source: file in csrc/cuda without its ending, or the path of a file elsewhere.
         dtype: float32 or float64, the type of all numbers.
         architecture: as `architecture_for` gives it.
 
@@ -32,7 +32,7 @@ def load_kernels(source: str, dtype: torch.dtype, architecture: str) -> bytes:
     folder = cache_folder()
     if folder is None:
         return compile_kernels(source, dtype, architecture)
-    path = folder / f"{source}-{_NUMBERS[dtype]}-{architecture}-{_key(source, dtype, architecture)}.bin"
+    path = folder / f"{_file_of(source).stem}-{_NUMBERS[dtype]}-{architecture}-{_key(source, dtype, architecture)}.bin"
     code = read_cached(path)
     if code is None:
         code = compile_kernels(source, dtype, architecture)
@@ -40,11 +40,11 @@ def load_kernels(source: str, dtype: torch.dtype, architecture: str) -> bytes:
     return code
 
 
-def compile_kernels(source: str, dtype: torch.dtype, architecture: str) -> bytes:
+def compile_kernels(source: str | Path, dtype: torch.dtype, architecture: str) -> bytes:
     """Compile as `load_kernels` does, without the cache: to a CUBIN for sm_XY, to PTX for compute_XY."""
     options = [option.encode() for option in (f"-DSNARF_NUMBER={_NUMBERS[dtype]}", *_OPTIONS)]
     options += [b"-I" + os.fsencode(folder) for folder in (cuda_sources() / "include", cuda_sources() / "cuda")]
-    return compile_source(cuda_sources() / "cuda" / f"{source}.cu", architecture, options)
+    return compile_source(_file_of(source), architecture, options)
 
 
 def architecture_for(capability: tuple[int, int]) -> str:
@@ -71,9 +71,14 @@ def cuda_sources() -> Path:
     return next((folder for folder in (package / "csrc", package.parent / "csrc") if folder.is_dir()), package / "csrc")
 
 
-def _key(source: str, dtype: torch.dtype, architecture: str) -> str:
+def _file_of(source: str | Path) -> Path:
+    return source if isinstance(source, Path) else cuda_sources() / "cuda" / f"{source}.cu"
+
+
+def _key(source: str | Path, dtype: torch.dtype, architecture: str) -> str:
     """Return a hash of all that the machine code depends on."""
-    digest = hashlib.sha256(repr((source, str(dtype), architecture, _OPTIONS, nvrtc_version())).encode())
+    digest = hashlib.sha256(repr((_file_of(source).stem, str(dtype), architecture, _OPTIONS, nvrtc_version())).encode())
+    digest.update(_file_of(source).read_bytes())
     for folder in ("cuda", "include"):
         for path in sorted((cuda_sources() / folder).rglob("*")):
             if path.is_file():

@@ -10,6 +10,7 @@ import ctypes
 import threading
 from ctypes import Structure, byref, c_char_p, c_int, c_uint, c_void_p
 from functools import cache
+from pathlib import Path
 from typing import Protocol
 
 import torch
@@ -41,12 +42,19 @@ class KernelLauncher(Protocol):
         ...
 
     def launch(
-        self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure, shared_bytes: int = 0
+        self,
+        source: str | Path,
+        kernel: str,
+        blocks: tuple[int, int],
+        threads: int,
+        arguments: Structure,
+        shared_bytes: int = 0,
     ) -> None:
-        """Run a kernel of csrc/cuda/<source>.cu with one structure as its argument, after all earlier launches.
+        """Run a kernel with one structure as its argument, after all earlier launches.
 
         Args:
-            source, kernel: names of the file and of the function.
+            source: file in csrc/cuda without its ending, or the path of a file elsewhere.
+            kernel: name of the function.
             blocks, threads: numbers of blocks, and of threads per block.
             arguments: the structure.
             shared_bytes: dynamic shared memory of a block, at most `most_shared_bytes`.
@@ -60,9 +68,9 @@ class Gpu:
         self.dtype = dtype
         self.device = device
         self._lock = threading.Lock()
-        self._functions: dict[tuple[str, str], c_void_p] = {}
-        self._modules: dict[str, c_void_p] = {}
-        self._granted: dict[tuple[str, str], int] = {}  # dynamic shared memory of each kernel
+        self._functions: dict[tuple[str | Path, str], c_void_p] = {}
+        self._modules: dict[str | Path, c_void_p] = {}
+        self._granted: dict[tuple[str | Path, str], int] = {}  # dynamic shared memory of each kernel
         self.capability = torch.cuda.get_device_capability(device)
         self._architecture = architecture_for(self.capability)
         # PyTorch's own context: kernels and memory belong to it.
@@ -77,7 +85,13 @@ class Gpu:
         return most
 
     def launch(
-        self, source: str, kernel: str, blocks: tuple[int, int], threads: int, arguments: Structure, shared_bytes: int = 0
+        self,
+        source: str | Path,
+        kernel: str,
+        blocks: tuple[int, int],
+        threads: int,
+        arguments: Structure,
+        shared_bytes: int = 0,
     ) -> None:
         function = self.load(source, kernel)
         if shared_bytes > self._granted.get((source, kernel), _ALWAYS_GRANTED_BYTES):
@@ -88,8 +102,8 @@ class Gpu:
         size = (c_uint(blocks[0]), c_uint(blocks[1]), c_uint(1), c_uint(threads), c_uint(1), c_uint(1))
         _check(cuda_driver().cuLaunchKernel(function, *size, c_uint(shared_bytes), stream, parameters, None))
 
-    def load(self, source: str, kernel: str) -> c_void_p:
-        """Return the handle of a kernel of csrc/cuda/<source>.cu, compiled and loaded on first use."""
+    def load(self, source: str | Path, kernel: str) -> c_void_p:
+        """Return the handle of a kernel in `source`, as for `launch`, compiled and loaded on first use."""
         # A thread of autograd may have no context yet; inside torch.cuda.device() it would get this one.
         _check(cuda_driver().cuCtxSetCurrent(self._context))
         function = self._functions.get((source, kernel))

@@ -6,6 +6,7 @@ address that the graph reads changes between replays.
 
 from __future__ import annotations
 
+import gc
 import logging
 from collections.abc import Callable, Sequence
 
@@ -86,26 +87,34 @@ class StepGraphs:
 
     def _run_aside(self, kind: StepKind) -> StepNumbers:
         """Take a step on the side stream."""
-        if self._side is None:
-            self._side = torch.cuda.Stream(self._step.device)
-        current = torch.cuda.current_stream(self._step.device)
-        self._side.wait_stream(current)
-        with torch.cuda.stream(self._side):
-            numbers = self._step.run(kind)
-            self._forget_gradients()
-        current.wait_stream(self._side)
+        side, current = self._side_stream(), torch.cuda.current_stream(self._step.device)
+        side.wait_stream(current)
+        try:
+            with torch.cuda.stream(side):
+                numbers = self._step.run(kind)
+                self._forget_gradients()
+        finally:
+            current.wait_stream(side)  # also if only a part of the step was launched
         return numbers
 
     def _capture(self, kind: StepKind) -> tuple[torch.cuda.CUDAGraph, StepNumbers]:
         """Capture a step, which takes none, in a graph; all graphs share their memory, as none needs another's results."""
-        graph = torch.cuda.CUDAGraph()
+        graph, side = torch.cuda.CUDAGraph(), self._side_stream()
         pool = next(iter(self._graphs.values()))[0].pool() if self._graphs else None
         self._forget_gradients()
-        with torch.cuda.device(self._step.device), torch.cuda.graph(graph, pool=pool):
+        gc.collect()  # a graph of autograd that is still there from an eager step would tie the capture to another stream
+        # On the stream of the steps before, for which cuBLAS has its workspaces. PyTorch's context manager alone would leave it
+        # as the current stream after a capture that failed.
+        with torch.cuda.device(self._step.device), torch.cuda.stream(side), torch.cuda.graph(graph, pool=pool, stream=side):
             numbers = self._step.run(kind)
         self._forget_gradients()
         log.debug("captured a step: %s", kind)
         return graph, numbers
+
+    def _side_stream(self) -> torch.cuda.Stream:
+        if self._side is None:
+            self._side = torch.cuda.Stream(self._step.device)
+        return self._side
 
 
 def _reason(error: RuntimeError) -> str:

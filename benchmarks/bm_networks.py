@@ -71,7 +71,7 @@ def _shape_step(config: ShapeConfig, count: int) -> Callable[[], object]:
 def _weights_step(count: int, depth: int) -> Callable[[], object]:
     field = NetworkWeights(PlainSoftmax(24), CanonicalGrid(*_BOX), 128, depth, 20.0, False)
     points = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    return lambda: torch.autograd.grad(field.at_fixed_points(points).square().sum(), list(field.parameters()))
+    return lambda: torch.autograd.grad(field.at_fixed_points(points, keeps_prior=True).square().sum(), list(field.parameters()))
 
 
 if __name__ == "__main__":

@@ -105,8 +105,9 @@ class FieldOnGrid(ActiveCells):
             return self._at_points(points, None if pose is None else torch.full((count,), pose, device=points.device))
         most = count if torch.is_grad_enabled() else max(1, _VALUES_AT_ONCE // self.field.most_values)
         if count <= most:
-            return self._checked(self.field.at_fixed_points(points), count)
-        return self._checked(torch.cat([self.field.at_fixed_points(part) for part in points.split(most)]), count)
+            return self._checked(self.field.at_fixed_points(points, keeps_prior=nodes is not None), count)
+        parts = [self.field.at_fixed_points(part, keeps_prior=False) for part in points.split(most)]
+        return self._checked(torch.cat(parts), count)
 
     def node_weights(self, active_only: bool = False, poses: int | None = None) -> NodeWeights | None:
         """Evaluate the skinning weights at the grid nodes; None for a field that is searched directly.

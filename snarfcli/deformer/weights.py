@@ -116,7 +116,7 @@ class NetworkWeights(WeightField):
         self.softmax = softmax
         self.sharpness = sharpness
         self.prior = prior
-        self._last: tuple[Tensor, Tensor] | None = None  # points, and the logits of the prior there
+        self._last: tuple[Tensor, Tensor] | None = None  # points, and the logits of the prior there, see `at_fixed_points`
         self.register_buffer("centre", torch.empty(0), persistent=False)
         self.register_buffer("half_extent", torch.empty(0), persistent=False)
         self.set_box(grid)
@@ -140,17 +140,22 @@ class NetworkWeights(WeightField):
         widths = [layer.out_features for layer in self.layers if isinstance(layer, nn.Linear)]
         return max(*widths, self.softmax.num_bones, segments)
 
-    def at_fixed_points(self, canonical: Tensor) -> Tensor:
-        """Return the same as `forward`, several times faster on a CPU, for the same tensor of points in step after step.
+    def at_fixed_points(self, canonical: Tensor, keeps_prior: bool) -> Tensor:
+        """Return the same as `forward`, several times faster on a CPU.
 
-        The prior at the points is kept. There are no second derivatives, which a search in the field itself needs.
+        There are no second derivatives, which a search in the field itself needs.
+
+        Args:
+            canonical: [N, 3], metres.
+            keeps_prior: whether to keep the prior at these points, for the same tensor in the next step, instead of that at
+                others. It stays at its place in memory as long as the tensor does, which captured CUDA graphs rely on.
         """
         first = (canonical - self.centre) / self.half_extent
         linears = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
         weights, biases = [layer.weight for layer in linears], [layer.bias for layer in linears]
         takes_first, takes_extras = [1] + [0] * (len(weights) - 1), [0] * len(weights)
         settings = (takes_first, takes_extras, ACTIVATIONS["softplus"], _SHARPNESS_OF_SOFTPLUS)
-        prior = None if self.prior is None else self._kept_prior(canonical)
+        prior = None if self.prior is None else self._prior_at(canonical, keeps_prior)
         return self._weights(run_perceptron(first, None, weights, biases, *settings), prior)
 
     def _weights(self, outputs: Tensor, prior: Tensor | None) -> Tensor:
@@ -158,12 +163,14 @@ class NetworkWeights(WeightField):
         logits = self.sharpness * outputs
         return self.softmax(logits if prior is None else logits + prior)
 
-    def _kept_prior(self, canonical: Tensor) -> Tensor:
-        """Return the logits of the prior, which are kept for the last tensor of points."""
+    def _prior_at(self, canonical: Tensor, keeps: bool) -> Tensor:
+        """Return the logits of the prior, those that are kept if they are for this tensor of points."""
         assert self.prior is not None
         last = self._last  # in one piece, since another thread may replace it
         if last is None or last[0] is not canonical:
-            last = self._last = canonical, self.softmax.invert(self.prior(canonical)).detach()
+            last = canonical, self.softmax.invert(self.prior(canonical)).detach()
+            if keeps:
+                self._last = last
         return last[1]
 
 

@@ -9,7 +9,7 @@ import torch
 from pretend_gpu.run import run_on_pretend_gpu
 from skinning_scenes import random_transforms, unit_grid
 
-from snarfcli.deformer import BonePrior, ForwardDeformer, SkinningConfig
+from snarfcli.deformer import BonePrior, ForwardDeformer, SkinningConfig, field_on_grid
 from snarfcli.draws import GeneratorDraws, HashedDraws
 
 FIELDS = [("distilled", False), ("distilled", True), ("voxel", True)]
@@ -109,3 +109,20 @@ def test_a_search_with_a_capacity_spares_the_wait():
     report = run_on_pretend_gpu(code)
     for name in ("distilled", "voxel", "preset"):
         assert (report[name].waits, report[name].copies, report[name].mixing) == ([], [], [])
+
+
+def test_what_a_captured_step_reads_of_the_prior_stays_in_its_place(monkeypatch):
+    one = deformer("distilled", with_prior=True)
+    one.set_active_cells(some_cells(3))
+    one.keep_room()
+    one.node_weights(active_only=True)
+    kept = one.field._last
+    assert kept[0] is one._active_points
+    whole = one.weight_grid()  # at other points
+    monkeypatch.setattr(field_on_grid, "_VALUES_AT_ONCE", 1000)
+    with torch.no_grad():
+        torch.testing.assert_close(one.node_weights(active_only=True).values[:4], whole[:4])  # in parts
+    assert one.field._last is kept
+    one.set_active_cells(some_cells(2))
+    one.node_weights(active_only=True)
+    assert one.field._last is not kept

@@ -265,7 +265,7 @@ def test_the_weight_field_is_evaluated_once_per_step(store, monkeypatch):
     transforms, calls = torch.eye(4).expand(2, 2, 4, 4), []
     field = model.deformer.field
     evaluate = field.at_fixed_points
-    monkeypatch.setattr(field, "at_fixed_points", lambda points: calls.append(1) or evaluate(points))
+    monkeypatch.setattr(field, "at_fixed_points", lambda *given, **named: calls.append(1) or evaluate(*given, **named))
     field.register_forward_hook(lambda *_: calls.append(1))
     found = model.find(torch.rand(2, 20, 3, generator=torch.Generator().manual_seed(0)), transforms, POSES)
     model.shape_at(found, POSES)

@@ -108,14 +108,21 @@ class Trainer:
         try:
             numbers = self._ahead.run(self.step, kind_of(self.config, self.step))
         except CaptureFailed as error:
-            log.info("steps are not captured in a CUDA graph from here on: %s", error)
-            self.settle()
-            self._ahead = None
-            return self._eager_step()
-        self.step += 1
-        if self.step % _SETTLE_EVERY == 0 or self.step >= self.config.steps:
-            numbers = self.settle() or numbers
-        return numbers
+            why = str(error)
+        else:
+            self.step += 1
+            return (self.settle() or numbers) if self._is_looked_at() else numbers
+        # Only here, where the error is gone, and with it all tensors of the step that failed, for which there was no memory.
+        log.info("steps are not captured in a CUDA graph from here on: %s", why)
+        numbers = self.settle()
+        self._ahead = None
+        return numbers or self._eager_step()
+
+    def _is_looked_at(self) -> bool:
+        """Return whether someone needs to know now which steps were taken."""
+        config = self.config
+        periods = (_SETTLE_EVERY, config.validate_every, config.checkpoint_every)
+        return self.step >= config.steps or any(is_due(self.step, every) for every in periods)
 
     def settle(self) -> StepNumbers | None:
         """Wait for all steps that were started, and set `step` to the number of those that were taken.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,9 @@ from snarfcli.hydra_config.schema import config_folder, register_schemas
 from snarfcli.models.trained_field import SYSTEMS
 from snarfcli.training import objective as objective_module
 from snarfcli.training.device_batches import DeviceBatches
+from snarfcli.training.graphs import CaptureFailed
 from snarfcli.training.loop import train
+from snarfcli.training.numbers import StepNumbers
 from snarfcli.training.schedule import StepKind, kind_of
 from snarfcli.training.trainer import Diverged, Trainer
 
@@ -193,6 +196,31 @@ def test_no_step_is_lost_where_the_capacity_is_often_too_small(store):
     assert largest_difference(one.optimizer.parameters, other.optimizer.parameters, 1e-3) <= 1e-3
 
 
+def test_a_failed_capture_leaves_no_memory_to_the_eager_step(store, monkeypatch):
+    trainer = trainer_for(store)
+    advance_to(trainer, 5)
+    left = []
+
+    def fail(step: int, kind: StepKind) -> None:
+        of_the_step = torch.zeros(3)
+        left.append(weakref.ref(of_the_step))
+        try:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        except torch.OutOfMemoryError as error:
+            raise CaptureFailed("there is not enough memory on the GPU") from error
+
+    def take() -> StepNumbers:
+        assert [one() for one in left] == [None]
+        return true_step()
+
+    true_step = trainer._eager_step
+    monkeypatch.setattr(trainer._ahead, "run", fail)
+    monkeypatch.setattr(trainer, "_eager_step", take)
+    trainer.advance()
+    assert trainer.step == 6
+    assert trainer._ahead is None
+
+
 @pytest.mark.parametrize("what", ["loss", "gradient"])
 def test_a_step_that_is_not_finite_changes_nothing_and_is_told(store, monkeypatch, what):
     trainer = trainer_for(store)
@@ -235,6 +263,29 @@ def test_the_loop_reports_every_step_once(store, tmp_path):
     assert all(math.isfinite(value) for _, numbers in scalars for value in numbers.values())
     assert result["steps_this_run"] == 70
     assert (tmp_path / "checkpoint.pt").exists()
+
+
+def test_validations_and_checkpoints_are_those_of_steps_that_were_taken(store, tmp_path, monkeypatch):
+    trainer = trainer_for(store, steps=24, validate_every=9, checkpoint_every=12)
+    validated, true_state, true_advance = [], trainer.state, trainer.advance
+
+    def advance() -> StepNumbers:
+        if trainer.step in (6, 10):  # for all steps until the host looks
+            trainer._ahead._static.capacity = 10
+        return true_advance()
+
+    def state() -> dict[str, object]:
+        before = trainer.step
+        content = true_state()
+        assert content["step"] == trainer.step == before
+        return content
+
+    monkeypatch.setattr(trainer, "advance", advance)
+    monkeypatch.setattr(trainer, "state", state)
+    monkeypatch.setattr(trainer, "validate", lambda: validated.append(trainer.step) or {"iou_bbox": 0.5, "iou_surface": 0.5})
+    told = []
+    train(trainer, tmp_path, on_scalars=lambda step, numbers: told.append(step) if "validation_iou_bbox" in numbers else None)
+    assert told == validated == [9, 18, 24]
 
 
 # ---------------------------------------------------------------- batches

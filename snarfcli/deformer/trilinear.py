@@ -67,7 +67,7 @@ def _(values, points, lower, upper):
 def _has_kernel(values: Tensor, *others: Tensor) -> bool:
     """Return whether there is a CUDA kernel for numbers of these types."""
     is_one_type = all(values.dtype == other.dtype for other in others) and values.dtype in (torch.float32, torch.float64)
-    return is_one_type and choose_backend("auto", "cuda") == "native"
+    return is_one_type and choose_backend("auto", values.device) == "native"
 
 
 def forward_jacobian(corner_transforms: Tensor, local: Tensor, origin: Tensor, cell_size: Tensor) -> tuple[Tensor, Tensor]:

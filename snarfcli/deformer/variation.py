@@ -34,8 +34,8 @@ def total_variation(weights: Tensor, grid: CanonicalGrid, used: Tensor | None = 
 
 def _has_kernel(weights: Tensor, size: Tensor) -> bool:
     """Return whether native kernels take these arguments on this device."""
-    kind = weights.device.type
-    return weights.dtype == size.dtype == torch.float32 and kind in _KERNELS and choose_backend("auto", kind) == "native"
+    takes = weights.dtype == size.dtype == torch.float32 and weights.device.type in _KERNELS
+    return takes and choose_backend("auto", weights.device) == "native"
 
 
 def variation_reference(weights: Tensor, size: Tensor, used: Tensor | None) -> Tensor:

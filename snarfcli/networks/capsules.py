@@ -26,8 +26,8 @@ def run_segment_distance(points: Tensor, segments: Tensor) -> Tensor:
 
 def _has_kernel(points: Tensor, segments: Tensor) -> bool:
     """Return whether native kernels take these arguments on this device."""
-    kind = points.device.type
-    return points.dtype == segments.dtype == torch.float32 and kind in _KERNELS and choose_backend("auto", kind) == "native"
+    takes = points.dtype == segments.dtype == torch.float32 and points.device.type in _KERNELS
+    return takes and choose_backend("auto", points.device) == "native"
 
 
 @torch.library.custom_op("snarf::nearest_segment", mutates_args=())

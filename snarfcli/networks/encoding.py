@@ -89,7 +89,7 @@ def _has_kernel(points: Tensor, table: Tensor, nodes: Sequence[int]) -> bool:
     kind = points.device.type
     takes = points.dtype == table.dtype == torch.float32 and kind in _KERNELS and table.shape[1] <= MAX_FEATURES
     takes &= kind != "cuda" or len(nodes) <= 3 * cuda_encoding.MAX_LEVELS
-    return takes and choose_backend("auto", kind) == "native"
+    return takes and choose_backend("auto", points.device) == "native"
 
 
 @torch.library.custom_op("snarf::encode", mutates_args=())

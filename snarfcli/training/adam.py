@@ -127,12 +127,12 @@ def adam_step_on_device_reference(
 
 
 @adam_step_on_device.register_kernel("cuda")
-def _(values, gradients, first, second, averages, *settings):
+def _(values, gradients, first, second, averages, rates, skips_untouched, learning_rate, *settings):
     arrays = (values, gradients, first, second, averages)
-    is_native = all(array.dtype == torch.float32 and array.is_contiguous() for kind in arrays for array in kind)
-    if is_native and choose_backend("auto", "cuda") == "native":
-        return cuda_optimizer.adam_step(*arrays, *settings)
-    return adam_step_on_device_reference(*arrays, *settings)
+    takes = all(array.dtype == torch.float32 and array.is_contiguous() for kind in arrays for array in kind)
+    is_native = takes and choose_backend("auto", learning_rate.device) == "native"
+    run = cuda_optimizer.adam_step if is_native else adam_step_on_device_reference
+    return run(*arrays, rates, skips_untouched, learning_rate, *settings)
 
 
 @adam_step_on_device.register_fake

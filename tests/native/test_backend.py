@@ -7,10 +7,13 @@ import warnings
 import pytest
 import torch
 from fake_gpus import FakeDriver, install_gpus
+from torch._subclasses import FakeTensorMode
 
 from snarfcli.cli.messages import user_message
+from snarfcli.deformer import trilinear, variation
 from snarfcli.native import backend, cuda, cuda_compile, cuda_driver
 from snarfcli.native.backend import choose_backend, why_no_kernels
+from snarfcli.networks import capsules, encoding
 
 GPU = torch.device("cuda", 0)
 LOG = "NVRTC 13.0 cannot compile gather.cu for sm_90:\nnvrtc: error: failed to open libnvrtc-builtins.so.13.0.\n  Make sure"
@@ -128,3 +131,21 @@ def test_a_missing_cache_is_told(monkeypatch, compiled):
     for module in (cuda_compile, cuda):
         monkeypatch.setattr(module, "cache_folder", lambda: None)
     assert cuda.cuda_status().endswith("kept in memory only, since there is no home folder")
+
+
+CHOICES = {
+    "segments": (capsules, lambda device: (torch.empty(4, 3, device=device), torch.empty(2, 2, 3, device=device))),
+    "encoding": (encoding, lambda device: (torch.empty(4, 3, device=device), torch.empty(2, 1, device=device), [])),
+    "variation": (variation, lambda device: (torch.empty(2, 2, 2, 3, device=device), torch.empty(3, device=device))),
+    "interpolation": (trilinear, lambda device: (torch.empty(2, 2, 2, 3, device=device), torch.empty(4, 3, device=device))),
+}
+
+
+@pytest.mark.parametrize(("module", "arguments"), CHOICES.values(), ids=CHOICES)
+def test_kernels_are_tried_on_the_gpu_of_the_tensors(monkeypatch, module, arguments):
+    """Not on the current one, which may be another that can or cannot run them."""
+    asked = []
+    monkeypatch.setattr(module, "choose_backend", lambda backend, device: asked.append((backend, device)) or "reference")
+    with FakeTensorMode():
+        assert not module._has_kernel(*arguments("cuda:1"))
+    assert asked == [("auto", torch.device("cuda", 1))]

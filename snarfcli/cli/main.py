@@ -21,7 +21,7 @@ from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 from snarfcli.interrupts import exit_code, signals_as_interrupts
-from snarfcli.slots import use_slot
+from snarfcli.slots import SLOT_VARIABLE, use_slot
 
 __all__ = ["COMMANDS", "Command", "main"]
 
@@ -179,14 +179,17 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
 
 @contextmanager
 def _slot_of_job() -> Iterator[None]:
-    """Give a job of a multirun the lowest number that no other running job has, so that they use different GPUs."""
+    """Give a job of a multirun the lowest number that no other running job has, so that they use different GPUs.
+
+    A slot that the user has given to the whole call stays.
+    """
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
     from snarfcli.locks import hold_slot
 
     hydra = HydraConfig.get()
-    if hydra.mode != RunMode.MULTIRUN:
+    if hydra.mode != RunMode.MULTIRUN or SLOT_VARIABLE in os.environ:
         yield
         return
     with hold_slot(Path(hydra.sweep.dir)) as slot, use_slot(slot):

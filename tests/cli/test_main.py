@@ -159,7 +159,8 @@ def test_jobs_of_a_multirun_that_run_at_the_same_time_have_different_slots(capsy
         assert run(capsys, "doctor", "-m", "subject=1,2")[0] == 0
     with use_slot(5):  # given by the user
         assert run(capsys, "doctor")[0] == 0
-    assert slots == [0, 0, 1, 1, 5]
+        assert run(capsys, "doctor", "-m", "subject=1,2")[0] == 0
+    assert slots == [0, 0, 1, 1, 5, 5, 5]
 
 
 def test_unwritable_and_full_folders_are_named():

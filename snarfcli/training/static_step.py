@@ -68,7 +68,9 @@ class StaticStep:
             state.zero_()
 
     def run(self, kind: StepKind) -> StepNumbers:
-        """Take the coming step, which must be of this kind and staged, or leave it and all further ones out.
+        """Take the coming step, one of those of the settings, or leave it and all further ones out.
+
+        It must be of this kind, and staged.
 
         Nothing waits for the device, and nothing is copied to or from it.
         """

@@ -103,7 +103,7 @@ class Trainer:
                 raised at most 50 steps later.
         """
         self._maintain_grids()
-        if self._ahead is None or not self._ahead.is_ready:
+        if self._ahead is None or not self._ahead.is_ready or self.step >= self.config.steps:
             return self._eager_step()
         try:
             numbers = self._ahead.run(self.step, kind_of(self.config, self.step))

@@ -184,6 +184,11 @@ def test_a_step_with_too_many_roots_changes_nothing_and_is_taken_later(store):
     assert losses == pytest.approx(advance_to(other, 12)[6:], rel=1e-5)
 
 
+def test_steps_beyond_the_last_can_be_taken(store):
+    one, other = (trainer_for(store, steps=6, warmup_steps=9, final_learning_rate=0.1) for _ in range(2))
+    assert advance_to(one, 12) == pytest.approx(advance_to(eager(other), 12), rel=1e-5)
+
+
 def test_no_step_is_lost_where_the_capacity_is_often_too_small(store):
     one, other = trainer_for(store, steps=24), eager(trainer_for(store, steps=24))
     assert one._ahead is not None

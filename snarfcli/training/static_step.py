@@ -68,11 +68,10 @@ class StaticStep:
             state.zero_()
 
     def run(self, kind: StepKind) -> StepNumbers:
-        """Take the coming step, one of those of the settings, or leave it and all further ones out.
+        """Take the coming step, or leave it and all further ones out.
 
-        It must be of this kind, and staged.
-
-        Nothing waits for the device, and nothing is copied to or from it.
+        It must be one of the settings' steps, of this kind, and staged. Nothing waits for the device, and nothing is copied to
+        or from it.
         """
         draws = partial(HashedDraws, self._batches.seed, self._step)
         evaluated = self._objective.evaluate(self._batches.batch(self._step), kind, draws, self.capacity)

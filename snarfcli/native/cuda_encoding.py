@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from ctypes import Array, Structure, c_float, c_int, c_longlong, c_uint, c_void_p
+from ctypes import Structure, c_int, c_longlong, c_void_p
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from snarfcli.native.cuda_arrays import FeatureLevel, aligned, feature_levels
 from snarfcli.native.cuda_driver import KernelLauncher, gpu
 
 __all__ = ["MAX_LEVELS", "encode", "encode_backward", "run_encode", "run_encode_backward"]
@@ -20,25 +20,13 @@ MAX_LEVELS = 32
 _THREADS = 256
 
 
-class _Level(Structure):
-    """`FeatureLevel` of csrc/include/snarf/places.h."""
-
-    _fields_ = [
-        ("lower", c_float * 3),
-        ("per_metre", c_float * 3),
-        ("nodes", c_int * 3),
-        ("rows", c_void_p),
-        ("row_count", c_uint),
-    ]
-
-
 class _Encoding(Structure):
     """`Encoding` of csrc/cuda/encoding.cu."""
 
     _fields_ = [
         *((name, c_void_p) for name in ("points", "frequencies", "table", "out", "v_out", "v_points", "v_table")),
         ("count", c_longlong),
-        ("levels", _Level * MAX_LEVELS),
+        ("levels", FeatureLevel * MAX_LEVELS),
         *((name, c_int) for name in ("frequency_count", "level_count", "features")),
     ]
 
@@ -93,7 +81,7 @@ class _Points:
 
     def __post_init__(self) -> None:
         self.points, self.frequencies = self.points.contiguous(), self.frequencies.contiguous()
-        self.table, self.rows = _aligned(self.table), self.rows.contiguous()
+        self.table, self.rows = aligned(self.table), self.rows.contiguous()
         self.levels = len(self.nodes) // 3
         if self.levels > MAX_LEVELS or min(self.nodes, default=2) < 2:
             raise ValueError(f"nodes: wanted at most {MAX_LEVELS} levels of 2 nodes or more along a side, got {self.nodes}")
@@ -103,20 +91,11 @@ class _Points:
             frequencies=self.frequencies.data_ptr(),
             table=self.table.data_ptr(),
             count=len(self.points),
-            levels=self._levels(),
+            levels=feature_levels(MAX_LEVELS, self.table, self.rows, self.nodes, self.boxes),
             frequency_count=len(self.frequencies),
             level_count=self.levels,
             features=self.table.shape[1],
         )
-
-    def _levels(self) -> Array[_Level]:
-        levels, place = (_Level * MAX_LEVELS)(), self.rows.data_ptr()
-        for level in range(self.levels):
-            nodes, box = self.nodes[3 * level : 3 * level + 3], self.boxes[6 * level : 6 * level + 6]
-            per_metre = [1 / c_float(size).value for size in box[3:]]
-            levels[level] = _Level((*box[:3],), (*per_metre,), (*nodes,), place, len(self.table))
-            place += self.rows.element_size() * math.prod(nodes)
-        return levels
 
 
 def run_encode(
@@ -164,9 +143,3 @@ def run_encode_backward(
         threads = launcher.threads(_THREADS)
         launcher.launch("encoding", "encode_backward", (-(-len(points) // threads), block_rows), threads, given.struct)
     return v_points, v_table
-
-
-def _aligned(tensor: Tensor) -> Tensor:
-    """Return the tensor contiguous and aligned to 16 bytes, as the kernels need it."""
-    tensor = tensor.contiguous()
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()

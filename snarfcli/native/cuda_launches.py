@@ -10,6 +10,7 @@ from math import prod
 import torch
 from torch import Tensor
 
+from snarfcli.native.cuda_arrays import aligned
 from snarfcli.native.cuda_driver import KernelLauncher
 
 __all__ = ["run_backward", "run_broyden", "run_complete"]
@@ -76,7 +77,7 @@ def run_complete(
     capacity: int | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Launch the kernels of a complete search; arguments and results as in `cuda.complete_search`."""
-    points, transforms = points.contiguous(), _aligned(transforms)
+    points, transforms = points.contiguous(), aligned(transforms)
     lower, upper = lower.to(points).contiguous(), upper.to(points).contiguous()
     active = None if active_cells is None else active_cells.contiguous()
     batch, count = points.shape[:2]
@@ -177,7 +178,7 @@ def run_broyden(
     capacity: int | None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Launch the kernels of Broyden's search; arguments and results as in `cuda.broyden_search`."""
-    points, transforms, starts = points.contiguous(), _aligned(transforms), starts.contiguous()
+    points, transforms, starts = points.contiguous(), aligned(transforms), starts.contiguous()
     lower, upper = lower.to(points).contiguous(), upper.to(points).contiguous()
     batch, count = points.shape[:2]
     _check_limits(batch * count, 0)
@@ -291,12 +292,6 @@ def _arguments(points: Tensor, transforms: Tensor, lower: Tensor, upper: Tensor,
 
 def _blocks(items: int, threads: int) -> int:
     return -(-items // threads)
-
-
-def _aligned(tensor: Tensor) -> Tensor:
-    """Return the tensor contiguous and aligned to 16 bytes, as the kernels need it."""
-    tensor = tensor.contiguous()
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
 
 
 def _unfilled(points: Tensor, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from ctypes import Array, Structure, c_float, c_int, c_longlong, c_uint, c_void_p
+from ctypes import Structure, c_float, c_int, c_longlong, c_void_p
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from snarfcli.native import cuda_driver
+from snarfcli.native.cuda_arrays import FeatureLevel, aligned, feature_levels
 from snarfcli.native.cuda_driver import KernelLauncher
 
 __all__ = ["NetworkArrays", "evaluate_network", "fits", "run_network"]
@@ -38,18 +38,6 @@ class _Packing(Structure):
     ]
 
 
-class _Level(Structure):
-    """`FeatureLevel` of csrc/include/snarf/places.h."""
-
-    _fields_ = [
-        ("lower", c_float * 3),
-        ("per_metre", c_float * 3),
-        ("nodes", c_int * 3),
-        ("rows", c_void_p),
-        ("row_count", c_uint),
-    ]
-
-
 class _Activation(Structure):
     """`Activation` of csrc/cuda/products.cuh."""
 
@@ -63,7 +51,7 @@ class _Evaluation(Structure):
         *((name, c_void_p) for name in ("points", "pose", "seen", "part_codes", "code_bias", "frequencies", "table")),
         *((name, c_void_p) for name in ("segments", "weights", "biases", "last", "out")),
         ("count", c_longlong),
-        ("levels", _Level * _MOST_LEVELS),
+        ("levels", FeatureLevel * _MOST_LEVELS),
         ("activation", _Activation),
         ("radius", c_float),
         ("slope", c_float),
@@ -156,7 +144,7 @@ def run_network(launcher: KernelLauncher, arrays: NetworkArrays, precision: str)
     pose, codes, frequencies, segments, rows = (
         tensor.contiguous() for tensor in (arrays.pose, arrays.codes, arrays.frequencies, arrays.segments, arrays.rows)
     )
-    table, seen, code_bias = _aligned(arrays.table), _contiguous(arrays.seen), _contiguous(arrays.code_bias)
+    table, seen, code_bias = aligned(arrays.table), _contiguous(arrays.seen), _contiguous(arrays.code_bias)
     call = _Evaluation(
         points.data_ptr(),
         pose.data_ptr(),
@@ -171,7 +159,7 @@ def run_network(launcher: KernelLauncher, arrays: NetworkArrays, precision: str)
         last.data_ptr(),
         out.data_ptr(),
         len(points),
-        _levels(arrays, table, rows),
+        feature_levels(_MOST_LEVELS, table, rows, arrays.nodes, arrays.boxes),
         _Activation(arrays.activation, -arrays.sharpness / math.log(2), 1 / arrays.sharpness),
         arrays.radius,
         arrays.slope,
@@ -241,17 +229,6 @@ def _shared_bytes(arrays: NetworkArrays, kernels: str, points: int) -> int:
     return points * (sum(arrays.padded.values()) * _BYTES[kernels] + 4)
 
 
-def _levels(arrays: NetworkArrays, table: Tensor, rows: Tensor) -> Array[_Level]:
-    levels, start = (_Level * _MOST_LEVELS)(), 0
-    for level in range(arrays.levels):
-        nodes, box = arrays.nodes[3 * level : 3 * level + 3], arrays.boxes[6 * level : 6 * level + 6]
-        per_metre = [float(1 / np.float32(size)) for size in box[3:]]
-        place = rows.data_ptr() + 4 * start
-        levels[level] = _Level((c_float * 3)(*box[:3]), (c_float * 3)(*per_metre), (c_int * 3)(*nodes), place, len(table))
-        start += math.prod(nodes)
-    return levels
-
-
 def _round_up(count: int, step: int) -> int:
     return -(-count // step) * step
 
@@ -262,9 +239,3 @@ def _contiguous(tensor: Tensor | None) -> Tensor | None:
 
 def _pointer(tensor: Tensor | None) -> int | None:
     return None if tensor is None else tensor.data_ptr()
-
-
-def _aligned(tensor: Tensor) -> Tensor:
-    """Return the tensor contiguous and aligned to 16 bytes."""
-    tensor = tensor.contiguous()
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()

@@ -128,9 +128,9 @@ __device__ __forceinline__ void list_units(const Search<S>& a, const Bins<S>& bi
   const int pose = blockIdx.y, t = threadIdx.x, threads = blockDim.x;
   const int cell = int(first) + t;
   Bounds<S> bounds;
-  bool is_searched = first + t < a.cells;
-  if (is_searched) bounds = ((const Bounds<S>*)a.bounds)[(long long)pose * a.cells + cell];
-  is_searched = is_searched && bounds.box[0] >= 0;
+  const Bounds<S>* const record = (const Bounds<S>*)a.bounds + (long long)pose * a.cells + cell;
+  const bool is_searched = first + t < a.cells && record->box[0] >= 0;
+  if (is_searched) bounds = *record;
   candidates[t] = 0;
   if (t == 0) wanted[0] = wanted[1] = 0;
   const long long all_rows = enter_box(bins, is_searched, bounds.centre, bounds.box, rows);
@@ -155,7 +155,7 @@ __device__ __forceinline__ void list_units(const Search<S>& a, const Bins<S>& bi
   Unit* list = (Unit*)a.units + most * pose;
   for (int slice = 0; slice < units; ++slice) {
     const long long at = begin[is_curved] + mine + slice;
-    list[is_curved ? most - 1 - at : at] = {cell, slice, units};
+    list[is_curved ? most - 1 - at : at] = {cell, slice, units, 0};
   }
 }
 

@@ -36,7 +36,8 @@ extern "C" __global__ void __launch_bounds__(256) interpolate_values(const Inter
   }
   S local[3], weights[8], sum = 0;
   const long long first = locate(grid, a.points + 3 * n, local);
-  for (int axis = 0; axis < 3; ++axis) local[axis] = smaller(larger(local[axis], S(0)), S(1));
+  for (int axis = 0; axis < 3; ++axis)
+    local[axis] = local[axis] < 0 ? S(0) : local[axis] > 1 ? S(1) : local[axis];  // NaN stays NaN
   corner_weights(local, weights);
   SNARF_UNROLL
   for (int k = 0; k < 8; ++k) sum += weights[k] * a.values[corner_node(grid, first, k) * a.channels + channel];

@@ -9,11 +9,12 @@ namespace snarf {
 namespace SNARF_ISA {
 
 // All that the test of a query reads, apart from the polynomial, which only halving and solving do. Both are aligned so that
-// they move in 16-byte pieces.
+// they move in 16-byte pieces, and are filled to the last byte: padding would be copied byte by byte, and read without ever
+// having been written.
 template <class S>
 struct alignas(16) Bounds {
-  S centre[3], box[3];  // posed, metres; a box that is negative: the cell is not searched
-  S inverse[9], reach[3], curvature;
+  S centre[3], box[3];  // posed, metres; box[0] < 0: the cell is not searched, and all else is undefined
+  S inverse[9], reach[3], curvature, zero;
 };
 template <class S>
 struct alignas(16) Polynomial {
@@ -23,7 +24,7 @@ struct alignas(16) Polynomial {
 // A cell, or one of several slices of its candidates.
 struct alignas(16) Unit {
   int cell;  // number in the group
-  int slice, slices;
+  int slice, slices, zero;
 };
 
 // A query and the cell, or part of a cell, that may hold a root of it. The lists: 0 has tame cells and parts, to be solved from
@@ -56,6 +57,7 @@ __device__ __forceinline__ void measure(const Cell<S>& cell, int level, Bounds<S
   }
   for (int i = 0; i < 9; ++i) bounds.inverse[i] = found.inverse[i];
   bounds.curvature = found.curvature;
+  bounds.zero = 0;
 }
 
 template <class S>

@@ -1,4 +1,4 @@
-"""How the kernels of csrc/cuda get tensors and feature grids."""
+"""What several kernels of csrc/cuda take as arguments: aligned arrays, and the levels of feature grids."""
 
 from __future__ import annotations
 
@@ -23,27 +23,21 @@ class FeatureLevel(Structure):
     ]
 
 
-def feature_levels(
-    room: int, rows: Tensor, row_count: int, nodes: Sequence[int], boxes: Sequence[float]
-) -> Array[FeatureLevel]:
-    """Return the structures of feature grids.
+def feature_levels(most: int, table: Tensor, rows: Tensor, nodes: Sequence[int], boxes: Sequence[float]) -> Array[FeatureLevel]:
+    """Return room for `most` levels, of which the first describe feature grids; arguments as those of `networks.encode`.
 
-    Args:
-        room: their number, at least that of the levels; the others are zero.
-        rows: contiguous; must outlive the kernel.
-        row_count: number of rows of the table.
-        nodes, boxes: as in `networks.encode`.
+    `rows` is contiguous int32, and has to outlive the kernel's launch.
     """
-    levels, place = (FeatureLevel * room)(), rows.data_ptr()
+    levels, place = (FeatureLevel * most)(), rows.data_ptr()
     for level in range(len(nodes) // 3):
-        shape, box = nodes[3 * level : 3 * level + 3], boxes[6 * level : 6 * level + 6]
+        along, box = nodes[3 * level : 3 * level + 3], boxes[6 * level : 6 * level + 6]
         per_metre = [1 / c_float(size).value for size in box[3:]]
-        levels[level] = FeatureLevel((*box[:3],), (*per_metre,), (*shape,), place, row_count)
-        place += rows.element_size() * math.prod(shape)
+        levels[level] = FeatureLevel((*box[:3],), (*per_metre,), (*along,), place, len(table))
+        place += rows.element_size() * math.prod(along)
     return levels
 
 
 def aligned(tensor: Tensor) -> Tensor:
-    """Return the tensor contiguous and aligned to 16 bytes, which kernels read at once."""
+    """Return the tensor contiguous and aligned to 16 bytes, for kernels that read as many at once."""
     tensor = tensor.contiguous()
     return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()

@@ -1,13 +1,15 @@
 """Run compiled kernels on a GPU through the CUDA driver, on PyTorch's current stream.
 
 The driver is called through ctypes and not through the package cuda.bindings: that would be one more dependency, tied to a CUDA
-version, and ten functions of the driver are enough.
+version, and a dozen functions of the driver are enough.
 """
 
 from __future__ import annotations
 
 import ctypes
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from ctypes import Structure, byref, c_char_p, c_int, c_uint, c_void_p
 from functools import cache
 from pathlib import Path
@@ -25,6 +27,7 @@ _MOST_SHARED_BYTES = 97  # CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
 _MULTIPROCESSORS = 16  # CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT
 _DYNAMIC_SHARED_BYTES = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
 _ALWAYS_GRANTED_BYTES = 48 * 1024
+_RELAXED = 2  # CU_STREAM_CAPTURE_MODE_RELAXED
 
 
 class KernelLauncher(Protocol):
@@ -94,9 +97,10 @@ class Gpu:
         shared_bytes: int = 0,
     ) -> None:
         function = self.load(source, kernel)
-        if shared_bytes > self._granted.get((source, kernel), _ALWAYS_GRANTED_BYTES):
-            _check(cuda_driver().cuFuncSetAttribute(function, c_int(_DYNAMIC_SHARED_BYTES), c_int(shared_bytes)))
-            self._granted[source, kernel] = shared_bytes
+        with self._lock:  # no other thread may lower what this launch is granted
+            if shared_bytes > self._granted.get((source, kernel), _ALWAYS_GRANTED_BYTES):
+                _check(cuda_driver().cuFuncSetAttribute(function, c_int(_DYNAMIC_SHARED_BYTES), c_int(shared_bytes)))
+                self._granted[source, kernel] = shared_bytes
         stream = c_void_p(torch.cuda.current_stream(self.device).cuda_stream)
         parameters = (c_void_p * 1)(ctypes.addressof(arguments))
         size = (c_uint(blocks[0]), c_uint(blocks[1]), c_uint(1), c_uint(threads), c_uint(1), c_uint(1))
@@ -108,7 +112,7 @@ class Gpu:
         _check(cuda_driver().cuCtxSetCurrent(self._context))
         function = self._functions.get((source, kernel))
         if function is None:
-            with self._lock:
+            with self._lock, _allowed_in_capture():
                 if source not in self._modules:
                     code, module = load_kernels(source, self.dtype, self._architecture), c_void_p()
                     _check(cuda_driver().cuModuleLoadData(byref(module), code))
@@ -139,6 +143,17 @@ def try_kernels(device: torch.device) -> None:
 @cache
 def _gpu(index: int, dtype: torch.dtype) -> Gpu:
     return Gpu(torch.device("cuda", index), dtype)
+
+
+@contextmanager
+def _allowed_in_capture() -> Iterator[None]:
+    """Let this thread load kernels while a CUDA graph is captured, which drivers since CUDA 12.3 can; older ones refuse."""
+    mode = c_int(_RELAXED)
+    _check(cuda_driver().cuThreadExchangeStreamCaptureMode(byref(mode)))  # `mode` becomes the one before
+    try:
+        yield
+    finally:
+        _check(cuda_driver().cuThreadExchangeStreamCaptureMode(byref(mode)))
 
 
 def _attribute(device: c_int, name: int) -> int:

@@ -91,7 +91,7 @@ class _Points:
             frequencies=self.frequencies.data_ptr(),
             table=self.table.data_ptr(),
             count=len(self.points),
-            levels=feature_levels(MAX_LEVELS, self.rows, len(self.table), self.nodes, self.boxes),
+            levels=feature_levels(MAX_LEVELS, self.table, self.rows, self.nodes, self.boxes),
             frequency_count=len(self.frequencies),
             level_count=self.levels,
             features=self.table.shape[1],

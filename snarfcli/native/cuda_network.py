@@ -121,13 +121,14 @@ def evaluate_network(arrays: NetworkArrays, precision: str) -> Tensor | None:
 def fits(launcher: KernelLauncher, arrays: NetworkArrays, precision: str) -> bool:
     """Return whether the kernels can evaluate a network.
 
-    They take 1 to 16 equal hidden layers of at most 384 outputs, and at most 8 levels of feature grids, as far as the values of
-    64 points have room in the shared memory of a block.
+    They take 1 to 16 equal hidden layers of at most 384 outputs, one of which takes the pose code, if there is one, and at most
+    8 levels of feature grids, as far as the values of 64 points have room in the shared memory of a block.
     """
     width = len(arrays.biases[0])
     is_plain = len(arrays.biases[-1]) == 1 and all(len(bias) == width for bias in arrays.biases[:-1])
+    has_place = arrays.code_layer < arrays.layers and (arrays.code_layer < 0 or arrays.codes.shape[2] > 0)
     is_small = 1 <= arrays.layers <= _MOST_LAYERS and arrays.levels <= _MOST_LEVELS
-    return is_plain and is_small and _points_at_once(launcher, arrays, _kernels(launcher, precision)) is not None
+    return is_plain and has_place and is_small and _points_at_once(launcher, arrays, _kernels(launcher, precision)) is not None
 
 
 def run_network(launcher: KernelLauncher, arrays: NetworkArrays, precision: str) -> Tensor:
@@ -158,7 +159,7 @@ def run_network(launcher: KernelLauncher, arrays: NetworkArrays, precision: str)
         last.data_ptr(),
         out.data_ptr(),
         len(points),
-        feature_levels(_MOST_LEVELS, rows, len(table), arrays.nodes, arrays.boxes),
+        feature_levels(_MOST_LEVELS, table, rows, arrays.nodes, arrays.boxes),
         _Activation(arrays.activation, -arrays.sharpness / math.log(2), 1 / arrays.sharpness),
         arrays.radius,
         arrays.slope,

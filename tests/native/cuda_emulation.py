@@ -26,6 +26,8 @@ _PROGRAMS = {"network": "network"}  # files of emulation/ with the kernels of a 
 class EmulatedGpu:
     """A launcher whose blocks have up to `block` threads; 1 is fastest. Blocks of the network have as many as on a GPU.
 
+    With `seed` the blocks of each launch run in an order of that seed, by which `work` is then ordered as well.
+
     `work` has what the blocks of each launch did, by kernel: int64 [blocks, 2, 3] with the sum over a block's threads and the
     most of one thread, of rounds (in which the block's threads take a candidate each), halvings of a cell and Newton solves.
     """
@@ -34,9 +36,10 @@ class EmulatedGpu:
     most_shared_bytes = 227 * 1024
     multiprocessors = 1
 
-    def __init__(self, dtype: torch.dtype, block: int = 1) -> None:
+    def __init__(self, dtype: torch.dtype, block: int = 1, seed: int = 0) -> None:
         self.dtype = dtype
         self.block = block
+        self.seed = seed
         self.launches: list[str] = []
         self.work: dict[str, list[np.ndarray]] = defaultdict(list)
 
@@ -57,6 +60,7 @@ class EmulatedGpu:
         assert (cuda_sources() / "cuda" / f"{source}.cu").read_text().count(f" {kernel}(") == 1
         assert min(blocks) > 0
         library = build_emulation(self.dtype, _PROGRAMS.get(source, "emulation"))
+        library.shuffle_blocks(self.seed)
         assert library.emulate(kernel.encode(), ctypes.byref(arguments), *blocks, threads)
         counted = np.ctypeslib.as_array(library.work_of_blocks(), (blocks[0] * blocks[1], 2, 3))
         self.work[kernel].append(counted.copy())

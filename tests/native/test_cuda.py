@@ -240,6 +240,39 @@ def test_result_does_not_depend_on_the_size_of_a_block(emulated, block, dtype, m
     assert all(torch.equal(a, b) for a, b in zip(one, many, strict=True))
 
 
+@pytest.fixture
+def filled_memory():
+    """Fill memory that is allocated without a value: with NaN, or with the largest integers."""
+    fills = torch.utils.deterministic.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = True
+    yield
+    torch.utils.deterministic.fill_uninitialized_memory = fills
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.parametrize("rooms", [None, [400, 40, 30, 3, 2]], ids=["usual", "full lists"])
+def test_result_does_not_depend_on_the_order_of_blocks_or_on_what_memory_held(emulated, rooms, monkeypatch, request):
+    monkeypatch.setattr(cuda_launches, "_WARPS", 40)
+    points, poses, _weights, grid, transforms = scene(24, 0.8, torch.float32, batch=2, count=150, shape=(3, 4, 4))
+    active = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(1)) < 0.7
+    place, given = (grid.lower, grid.upper, (3, 4, 4)), (False, 900)
+    wanted = emulated.complete(points, transforms, grid, (3, 4, 4), active, capacity=900)
+    assert 200 < int(wanted[3]) < 900
+    starts = start_transforms(poses, None)
+    broyden = emulated.broyden(points, transforms, starts, grid, (3, 4, 4), capacity=900)
+    if rooms:
+        monkeypatch.setattr(cuda_launches, "_rooms", lambda queries, slots: rooms)
+    request.getfixturevalue("filled_memory")
+    for seed in (1, 2, 3):
+        launcher = EmulatedGpu(torch.float32, seed=seed)
+        found = cuda_launches.run_complete(launcher, points, transforms, *place, active, 5e-6, 10, *given)
+        assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+        assert (launcher.work["search_rest"][0].sum() > 0) == (rooms is not None)
+        found = cuda_launches.run_broyden(launcher, points, transforms, starts, *place, 5e-6, 0.25, 10, True, *given)
+        assert all(torch.equal(a, b) for a, b in zip(found, broyden, strict=True))
+
+
 def test_result_does_not_depend_on_batch_groups_or_guesses(runner, monkeypatch):
     points, _, _, grid, transforms = scene(24, 0.7, torch.float32, batch=3)
     whole = runner.complete(points, transforms, grid, SHAPE)
@@ -444,12 +477,14 @@ def test_a_search_with_a_capacity_fits_into_a_cuda_graph():
     points, _, _, grid, transforms = scene(24, 0.5, torch.float32)
     points, transforms, grid = points.cuda(), transforms.cuda(), grid.to(points.cuda())
     rest = (grid.lower, grid.upper, SHAPE, None, 5e-6, 10, False, 600)
+    place = (grid.lower, grid.upper, SHAPE, 2, 200, True, True)
     wanted = cuda.complete_search(points, transforms, *rest)
+    cuda.implicit_backward(wanted[0], *wanted[:3], *place)  # loads the kernel
     static = torch.zeros_like(points)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
         found = cuda.complete_search(static, transforms, *rest)
-        v_points, _ = cuda.implicit_backward(found[0], *found[:3], grid.lower, grid.upper, SHAPE, 2, 200, True, True)
+        v_points, _ = cuda.implicit_backward(found[0], *found[:3], *place)
     static.copy_(points)
     graph.replay()
     assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))

@@ -54,6 +54,14 @@ def test_nvrtc_compiles_every_kernel(architecture, dtype):
 
 
 @needs_nvrtc
+def test_structures_in_memory_have_no_padding_that_is_copied():
+    """It would be copied byte by byte; nothing else here is, and initcheck would report reads of what nobody wrote."""
+    code = cuda_compile.compile_kernels("candidates", torch.float32, "compute_80")
+    assert b".entry search_cells" in code
+    assert not re.findall(rb"\.v\d\.[bsu]8\b.*", code)
+
+
+@needs_nvrtc
 def test_the_network_compiles_without_tensor_cores():
     code = cuda_compile.compile_kernels("network", torch.float32, "sm_75")
     assert b".text.evaluate_float32_64" in code

@@ -38,3 +38,25 @@ def test_large_shared_memory_is_asked_for_once(driver):
     assert driver.called.count("cuFuncSetAttribute") == 2
     assert driver.called.count("cuLaunchKernel") == 6
     assert driver.called.count("cuModuleLoadData") == 1
+
+
+def test_kernels_are_loaded_as_a_capture_allows(driver, monkeypatch):
+    """Strict modes refuse to load in any thread while one captures; the thread's own mode is set again afterwards."""
+    mode, seen = [0], []
+
+    def exchange(wanted):
+        wanted._obj.value, mode[0] = mode[0], wanted._obj.value
+        return 0
+
+    def load(module, code):
+        seen.append(mode[0])
+        return len(seen) == 1  # an error the first time
+
+    monkeypatch.setattr(driver, "cuThreadExchangeStreamCaptureMode", exchange, raising=False)
+    monkeypatch.setattr(driver, "cuModuleLoadData", load, raising=False)
+    gpu = Gpu(torch.device("cuda", 0), torch.float32)
+    with pytest.raises(RuntimeError, match="CUDA: error 1 of the driver"):
+        gpu.load("source", "kernel")
+    gpu.load("source", "kernel")
+    assert seen == [2, 2]
+    assert mode == [0]

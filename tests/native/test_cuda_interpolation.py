@@ -68,6 +68,15 @@ def test_values_are_those_of_the_reference(runner, count, channels, dtype):
     torch.testing.assert_close(found.double(), wanted(values, points), rtol=0, atol=tolerance)
 
 
+def test_points_that_are_not_finite(runner):
+    values, points = arrays(4)
+    points[:] = torch.tensor([[torch.nan, 0, 0], [0, torch.inf, 0], [0, 0, -torch.inf], [0, -torch.inf, torch.nan]])
+    found = runner(values, points)
+    assert found[[0, 3]].isnan().all()
+    border = points.clamp(*BOX)
+    torch.testing.assert_close(found[1:3].double(), wanted(values, border)[1:3], rtol=0, atol=2e-6)
+
+
 def test_strided_values_and_any_number_of_threads(runner):
     values, points = arrays(90)
     strided = values.transpose(0, 2).contiguous().transpose(0, 2)

@@ -273,6 +273,10 @@ def test_networks_that_do_not_fit():
     grid = replace(preset("grid"), feature_cells_m=[0.5] * 9)
     for config in (replace(preset("mlp"), depth=17), replace(ODD, depth=0, condition_layer=None), grid):
         assert not fits(HOPPER, arrays_of(config), "highest")
+    arrays = arrays_of(TWO_LAYERS)
+    assert fits(HOPPER, arrays, "highest")
+    assert not fits(HOPPER, replace(arrays, code_layer=arrays.layers), "highest")  # the last layer, which is summed apart
+    assert not fits(HOPPER, replace(arrays, codes=arrays.codes[:, :, :0]), "highest")
 
 
 def test_chips_without_tensor_cores_use_float32():

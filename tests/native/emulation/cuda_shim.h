@@ -1,4 +1,5 @@
-// Enough of CUDA's language to compile the kernels of csrc/cuda as C++ and run them on the CPU, one block after the other.
+// Enough of CUDA's language to compile the kernels of csrc/cuda as C++ and run them on the CPU, one block after the other, in
+// the order of their numbers or in any other.
 //
 // Each thread of a block is a fiber: they take turns on one thread of the operating system, from one barrier to the next, which
 // is fast for blocks of any size. With -fsanitize=thread each is a thread of the operating system instead, so that what is
@@ -17,6 +18,7 @@
 #include <condition_variable>
 #include <memory>
 #include <mutex>
+#include <random>
 #include <thread>
 #include <vector>
 
@@ -197,10 +199,18 @@ inline void take_work(std::vector<Work>& work) {
   work.push_back(most);
 }
 
+// Numbers of the blocks in the order in which they run; any other seed than 0 shuffles them.
+inline std::vector<unsigned> order_of_blocks(unsigned blocks, unsigned seed) {
+  std::vector<unsigned> order(blocks);
+  for (unsigned block = 0; block < blocks; ++block) order[block] = block;
+  if (seed) std::shuffle(order.begin(), order.end(), std::mt19937(seed));
+  return order;
+}
+
 // Runs a kernel on every block of the grid. Shared memory is static, so blocks do not run side by side. `work` gets what
-// each block did: two entries, see take_work().
+// each block did, in the order in which they ran: two entries, see take_work().
 template <class Arguments>
-void run_grid(void (*kernel)(Arguments), const Arguments& arguments, unsigned x, unsigned y, unsigned threads,
+void run_grid(void (*kernel)(Arguments), const Arguments& arguments, unsigned x, unsigned y, unsigned threads, unsigned seed,
               std::vector<Work>& work) {
   gridDim = {x, y, 1};
   blockDim = {threads, 1, 1};
@@ -208,15 +218,15 @@ void run_grid(void (*kernel)(Arguments), const Arguments& arguments, unsigned x,
   running_block = &block;
   thread_work.assign(threads, Work());
   work.clear();
+  const std::vector<unsigned> order = order_of_blocks(x * y, seed);
   block.run([&](unsigned thread) {
-    for (unsigned row = 0; row < y; ++row)
-      for (unsigned column = 0; column < x; ++column) {
-        threadIdx = {thread, 0, 0};
-        blockIdx = {column, row, 0};
-        kernel(arguments);
-        __syncthreads();  // the next block uses the same shared memory
-        if (!thread) take_work(work);
-        __syncthreads();
-      }
+    for (const unsigned number : order) {
+      threadIdx = {thread, 0, 0};
+      blockIdx = {number % x, number / x, 0};
+      kernel(arguments);
+      __syncthreads();  // the next block uses the same shared memory
+      if (!thread) take_work(work);
+      __syncthreads();
+    }
   });
 }

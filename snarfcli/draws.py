@@ -121,7 +121,7 @@ def random_bits(step: Tensor, key: int, count: int) -> Tensor:
     Args:
         step: [], int64.
         key: 32 bits, different for numbers that should be independent.
-        count: number of places.
+        count: number of places, at most 2^32.
 
     Source: the form of the hash (shift, xor, multiply) is that of the finalizer of MurmurHash3 (Appleby, 2011).
     """
@@ -141,8 +141,10 @@ def _(step, key, count):
 
 
 def _random_bits_reference(step: Tensor, key: int, count: int) -> Tensor:
-    of_step = _mixed_tensor(step.reshape(1) ^ key)
-    return _mixed_tensor(torch.arange(count, device=step.device) ^ of_step)
+    first = _mixed_tensor(step.reshape(1) ^ key)
+    second = _mixed_tensor((step.reshape(1) + _mixed(key)) & (_BITS - 1))  # streams with the same first still differ
+    places = _mixed_tensor(torch.arange(count, device=step.device) ^ first)
+    return _mixed_tensor((places + second) & (_BITS - 1))
 
 
 def _mixed_tensor(bits: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 // Random bits that depend on a step and a place only (snarfcli/draws.py).
 //
-// DESIGN. One thread a number. Each hashes the step anew, in a dozen instructions, instead of reading the hash from memory. The
+// DESIGN. One thread a number. Each hashes the step anew, in some thirty instructions, instead of reading the hash from memory. The
 // step is read from the device, so that a CUDA graph draws other numbers in every replay.
 #include "snarf/platform.h"
 
@@ -26,7 +26,9 @@ __device__ unsigned mixed_bits(unsigned bits) {
 extern "C" __global__ void __launch_bounds__(256) draw_bits(const DrawTask a) {
   const long long place = (long long)blockIdx.x * blockDim.x + threadIdx.x;
   if (place >= a.count) return;
-  a.bits[place] = mixed_bits((unsigned)place ^ mixed_bits((unsigned)*a.step ^ a.key));
+  const unsigned step = (unsigned)*a.step;
+  const unsigned first = mixed_bits(step ^ a.key), second = mixed_bits(step + mixed_bits(a.key));
+  a.bits[place] = mixed_bits(mixed_bits((unsigned)place ^ first) + second);
 }
 
 }  // namespace SNARF_ISA

@@ -80,7 +80,10 @@ class ActiveCells(nn.Module):
             raise ValueError(f"{name}: wanted bool {wanted}, got {came}")
 
     def _update_active_nodes(self) -> None:
-        """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU."""
+        """Keep which nodes active cells have, flat indices [K] and positions [K, 3]: finding them waits for a GPU.
+
+        With room for more, the indices beyond are those of no node, D * H * W and more.
+        """
         self.searches_all_cells = bool(self.active_cells.all())
         used = corners_of(self.active_cells)
         nodes, places = used.reshape(-1).nonzero()[:, 0], self.active_cells.nonzero()
@@ -93,6 +96,8 @@ class ActiveCells(nn.Module):
         self._used_nodes.copy_(used)
         self._active_count.copy_(count)
         self._active_nodes = _fill(self._active_nodes, nodes, math.prod(self.shape))
+        # All different, so that a GPU which sums gradients of their rows does not queue at one of them.
+        self._active_nodes[len(nodes) :] += torch.arange(len(self._active_nodes) - len(nodes), device=nodes.device)
         self._active_places = _fill(self._active_places, places, 0)
         kept = self._active_points[:0] if self._renews_points else self._active_points
         self._active_points = _fill(kept, points, 0, len(self._active_nodes))

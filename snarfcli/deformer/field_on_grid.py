@@ -90,8 +90,9 @@ class FieldOnGrid(ActiveCells):
             return self._weights_of_nodes(None, pose).reshape(*self.shape, -1)
         used, count = self._active_nodes, math.prod(self.shape)
         # With room for more nodes, those that are not used yet go to a row of their own, which is then left out.
-        weights = self._weights_of_nodes(used.clamp_max(count - 1) if self._keeps_room else used, pose)
-        grid = weights.new_zeros(count + self._keeps_room, self.num_bones).index_copy(0, used, weights)
+        weights = self._weights_of_nodes(used % count if self._keeps_room else used, pose)
+        rows = used.clamp_max(count) if self._keeps_room else used
+        grid = weights.new_zeros(count + self._keeps_room, self.num_bones).index_copy(0, rows, weights)
         return grid[:count].reshape(*self.shape, -1)
 
     def _weights_of_nodes(self, nodes: Tensor | None, pose: int | None) -> Tensor:

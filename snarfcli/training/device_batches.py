@@ -72,7 +72,7 @@ class DeviceBatches(FrameBatches):
         )
 
     def _chosen_frames(self, step: Tensor) -> Tensor:
-        """Return the numbers of the frames of a step, [B]; all are different unless there are fewer than B."""
+        """Return the numbers of the frames of a step, [B]; all are different unless there are fewer than B, or 2^20 or more."""
         draws, count, frames = HashedDraws(self.seed, step, _FRAMES), self.config.poses_per_step, len(self.frames)
         if count > frames or frames >= 2**_FRAME_BITS:
             return draws.integers(frames, count)

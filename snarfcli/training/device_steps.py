@@ -127,7 +127,7 @@ def choose_batches(store: SampleStore, config: TrainingConfig, seed: int, device
     except (RuntimeError, MemoryError) as error:
         if not is_out_of_memory(error):
             raise
-        log.info("the training step is not captured in a CUDA graph: %s has no memory for all samples", device)
+        log.info("the training step is not captured in a CUDA graph: %s has no memory for the samples", device)
         return new_batches(store, config, seed, device)
     if device.type != "cuda":
         log.info("training.graph=on: steps have fixed shapes, and are not captured, since there is no CUDA device")

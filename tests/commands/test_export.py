@@ -293,7 +293,7 @@ def test_an_export_without_its_record_can_be_run_again(folder, toy, capsys, monk
 
 
 def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
-    follow, calls = SkinnedSurface.canonical_vertices, []
+    follow, calls = SkinnedSurface.shape_in, []
 
     def sometimes(self, pose):
         calls.append(0)
@@ -301,7 +301,7 @@ def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
             raise EmptySurface("the field is unoccupied")
         return follow(self, pose)
 
-    monkeypatch.setattr(SkinnedSurface, "canonical_vertices", sometimes)
+    monkeypatch.setattr(SkinnedSurface, "shape_in", sometimes)
     assert export(capsys, "--pose", pose_file("walk.npz", 4))[0] == 1
     assert "clip walk, frame 1: the shape could not be computed: the field is unoccupied" in caplog.text
     calls.clear()

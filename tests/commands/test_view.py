@@ -208,6 +208,7 @@ def test_a_server_that_ends_by_itself_leaves_its_port(config, monkeypatch):
 
 
 ENDLESS = """
+import signal
 import sys
 from types import SimpleNamespace
 
@@ -228,6 +229,7 @@ class Endless(ToyAvatar):
 avatar = Endless()
 avatar.config = SimpleNamespace(model=SimpleNamespace(name="capsules"), condition=SimpleNamespace(name="none"))
 Avatar.load = classmethod(lambda cls, path, device: avatar)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background
 sys.exit(main(["view", "--no-open", "ckpt=toy.pt", "data=meshes", "subject=a"]))
 """
 

@@ -21,7 +21,7 @@ help:
 	@echo "make lint      check style, format and types of the code"
 	@echo "make format    format the code"
 	@echo "make bench     measure the searches, preprocessing, batches, a training step, evaluation and mesh extraction"
-	@echo "make gpu       check and measure everything that runs on a GPU, in ten minutes after some of preparation on the CPU"
+	@echo "make gpu       check and measure everything that runs on a GPU, in nine minutes at most, after minutes of preparation on the CPU"
 	@echo "make clean     remove .venv, builds, samples and results"
 
 setup: $(INSTALLED)
@@ -87,6 +87,7 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_video.py
 
 gpu: $(INSTALLED)
+	$(VENV)/bin/python benchmarks/gpu_check.py --look
 	$(VENV)/bin/python benchmarks/pack_gpu_check.py
 	$(VENV)/bin/python benchmarks/gpu_check.py
 

@@ -48,8 +48,8 @@ def rows_of(case: str, work: dict[str, list[np.ndarray]]) -> list[list[str]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--counts", default="20000,200000", help="numbers of queries")
-    parser.add_argument("--poses", default=",".join(POSES))
+    parser.add_argument("--counts", type=int, nargs="+", default=[20_000, 200_000], help="numbers of queries")
+    parser.add_argument("--poses", nargs="+", default=list(POSES))
     folder = Path(__file__).resolve().parents[1] / "tests" / "native"
     parser.add_argument("--kernels", type=Path, default=folder, help="folder with the emulation")
     options = parser.parse_args()
@@ -59,10 +59,10 @@ def main() -> None:
     from snarfcli.native import cuda_launches
 
     settings, rows = SearchConfig(), []
-    for pose in options.poses.split(","):
+    for pose in options.poses:
         scene = body_scene(pose)
         transforms = blend_transforms(scene.weights, scene.transforms[None])
-        for count in map(int, options.counts.split(",")):
+        for count in options.counts:
             for kind, near in CASES:
                 launcher = EmulatedGpu(torch.float32, block=128)
                 box = (scene.grid.lower, scene.grid.upper, scene.shape, scene.near_cells if near else None)

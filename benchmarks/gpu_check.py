@@ -3,7 +3,7 @@
     python benchmarks/pack_gpu_check.py        with all packages: samples, avatars and scenes into outputs/gpu_check
     python benchmarks/gpu_check.py             there or on another machine: all stages
     python benchmarks/gpu_check.py --resume    only those that are not done; an interrupted training run continues
-    python benchmarks/gpu_check.py --dry-run   without a GPU: the code of all stages on little work
+    python benchmarks/gpu_check.py --dry-run   without a GPU: the code of all stages on little work, with the same folder
 
 Each stage (gpu_checks/) is a process with a time limit: one that fails or takes too long is reported, and the next one runs.
 The report, benchmarks/results/gpu-<name>.md, is written after each stage, and the raw numbers beside it as JSON.
@@ -39,6 +39,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--pack", type=Path, default=ROOT / "outputs" / "gpu_check", help="folder made by pack_gpu_check.py")
     parser.add_argument("--work", type=Path, default=ROOT / "outputs" / "gpu_check_work", help="folder for runs and logs")
     parser.add_argument("--out", type=Path, help="the report, a Markdown file (default: in benchmarks/results)")
+    parser.add_argument("--look", action="store_true", help="only look for a GPU: exit code 2 and a line if there is none")
     parser.add_argument("--only", help=f"comma-separated stages: {', '.join(stage.name for stage in STAGES)}")
     parser.add_argument("--skip", help="comma-separated stages to leave out")
     parser.add_argument("--minutes", type=float, default=9.0, help="for all stages together")
@@ -67,10 +68,16 @@ def choose_stages(only: str | None, skip: str | None) -> list[Stage]:
     return chosen
 
 
+def require_gpu() -> None:
+    """Raise UserError if there is no GPU."""
+    if not torch.cuda.is_available():
+        raise UserError(f"CUDA is {cuda.cuda_status()}; --dry-run runs the code of all stages on the CPU")
+
+
 def check_place(options: argparse.Namespace) -> None:
     """Raise UserError if there is no GPU, no pack or no time."""
-    if not options.dry_run and not torch.cuda.is_available():
-        raise UserError(f"no GPU: {cuda.cuda_status()}; --dry-run runs the code of all stages on the CPU")
+    if not options.dry_run:
+        require_gpu()
     missing = [name for name in PACKED if not (options.pack / name).exists()]
     if missing:
         raise UserError(f"{options.pack} has no {missing[0]}; make it with: python benchmarks/pack_gpu_check.py")
@@ -120,6 +127,9 @@ def check(options: argparse.Namespace) -> bool:
 def main() -> int:
     options = parse()
     try:
+        if options.look:
+            require_gpu()
+            return 0
         if options.stage:
             run_stage(options)
             return 0

@@ -11,6 +11,7 @@ there already is kept.
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
 import subprocess
 import sys
@@ -69,9 +70,11 @@ def pack(options: argparse.Namespace) -> None:
     """Make what is missing in the folder and print what it holds.
 
     Raises:
-        UserError: a package is not installed here, or the folder is larger than the limit.
+        UserError: --python is no version, a package is not installed here, or the folder is larger than the limit.
         CalledProcessError: a command failed; its output says why.
     """
+    if options.python and not re.fullmatch(r"3\.\d{1,2}", options.python):
+        raise UserError(f"--python: wanted a version such as 3.12, got {options.python}")
     out, build = options.out.resolve(), options.build.resolve()
     out.mkdir(parents=True, exist_ok=True)
     if not (out / "data" / "processed" / "builtin" / SUBJECT / "manifest.json").exists():

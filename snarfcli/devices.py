@@ -11,6 +11,7 @@ from functools import cache
 
 import torch
 
+from snarfcli.errors import UserError
 from snarfcli.slots import current_slot
 from snarfcli.texts import one_line
 
@@ -72,6 +73,13 @@ def why_unusable(gpu: torch.device) -> str | None:
 
 
 def gpus_in_turn() -> list[torch.device]:
-    """Return all GPUs, beginning with that of this process: cuda:N, where N is its slot modulo the number of GPUs."""
-    count, first = torch.cuda.device_count(), current_slot()
+    """Return all GPUs, beginning with that of this process: cuda:N, where N is its slot modulo the number of GPUs.
+
+    Raises:
+        UserError: the environment variable of the slot is no number.
+    """
+    try:
+        count, first = torch.cuda.device_count(), current_slot()
+    except ValueError as error:
+        raise UserError(str(error)) from None
     return [torch.device("cuda", (first + further) % count) for further in range(count)]

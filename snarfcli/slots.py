@@ -13,9 +13,15 @@ SLOT_VARIABLE = "SNARF_GPU_SLOT"
 
 
 def current_slot() -> int:
-    """Return the slot of this process; 0 if it has none."""
+    """Return the slot of this process; 0 if it has none.
+
+    Raises:
+        ValueError: the environment variable is no number; the message is one line.
+    """
     text = os.environ.get(SLOT_VARIABLE, "")
-    return int(text) if text.isdecimal() else 0
+    if text and not (text.isascii() and text.isdecimal() and len(text) < 10):
+        raise ValueError(f"{SLOT_VARIABLE}: wanted a whole number from 0, got {text[:40]!r}; correct or unset it")
+    return int(text) if text else 0
 
 
 @contextmanager

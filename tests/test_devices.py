@@ -120,14 +120,20 @@ def test_the_gpu_of_a_result_is_the_one_that_computed_it(four_gpus):
         assert "gpu" not in machine_facts(device)["machine"]
 
 
-def test_slots_are_restored_and_anything_else_is_none(monkeypatch):
+def test_slots_are_restored(monkeypatch):
     monkeypatch.setenv(SLOT_VARIABLE, "1")
     with use_slot(5):
         assert current_slot() == 5
     assert current_slot() == 1
-    for other in ("", "-1", "two"):
-        monkeypatch.setenv(SLOT_VARIABLE, other)
-        assert current_slot() == 0
+    monkeypatch.setenv(SLOT_VARIABLE, "")
+    assert current_slot() == 0
+
+
+@pytest.mark.parametrize("text", ["-1", "two", "1" * 30, "\u0663"])
+def test_a_slot_that_is_no_number_is_refused(four_gpus, monkeypatch, text):
+    monkeypatch.setenv(SLOT_VARIABLE, text)
+    with pytest.raises(UserError, match=r"^SNARF_GPU_SLOT: wanted a whole number from 0, got '[^\n]*'; correct or unset it$"):
+        choose_device("auto")
 
 
 def test_checking_a_device_starts_nothing(four_gpus, monkeypatch):

@@ -29,6 +29,7 @@ from snarfcli.models.shape_sizes import with_shape_sizes
 from snarfcli.models.start_bones import with_start_bones
 from snarfcli.models.symmetry import find_mirror
 from snarfcli.models.trained_field import SYSTEMS
+from snarfcli.native.backend import choose_backend
 from snarfcli.output_locks import hold_all_inside, hold_output
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
@@ -76,6 +77,8 @@ def _prepare(config: TrainConfig, folder: Path, device: torch.device) -> Trainer
     sequences = store.sequences("train")
     frames = sum(len(sequence.train_frames) for sequence in sequences)
     log.info("data: %s, subject %s, %d sequences, %d frames to train on", store.data, store.subject, len(sequences), frames)
+    if config.search.backend == "native":
+        choose_backend("native", device)  # raises before anything is written
     try:
         trainer = new_trainer(config, store, device)
     except ValueError as error:  # the message of a network or grid names the setting

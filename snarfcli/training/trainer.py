@@ -249,6 +249,7 @@ class Trainer:
             "avatar": self.avatar.to_dict(),
             "training": asdict(self.config),
             "random": torch.get_rng_state(),
+            "draws_on_device": self._ahead is not None,
             "poses": None if self.refiner is None else self.refiner.state(),
         } | self.optimizer.state()
 
@@ -269,6 +270,8 @@ class Trainer:
             if self._ahead is not None:
                 self._ahead.follow()
             self.seconds = checked_seconds(state.get("seconds", 0.0))
+            if state.get("draws_on_device", self._ahead is not None) != (self._ahead is not None):
+                log.info("other random numbers than before from here on: training.graph or the device has changed")
         except (LookupError, RuntimeError, TypeError, ValueError, AttributeError) as error:
             if is_out_of_memory(error):
                 raise

@@ -164,7 +164,8 @@ def test_stages_are_chosen_by_name():
 def test_what_is_missing_is_said_in_one_line(pack, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for given, wanted in (
-        (["--pack", str(pack)], "no GPU: "),
+        (["--pack", str(pack)], "CUDA is not available: "),
+        (["--look"], "CUDA is not available: "),
         (["--dry-run", "--pack", str(tmp_path)], "has no scenes.pt; make it with: python benchmarks/pack_gpu_check.py"),
         (["--dry-run", "--pack", str(pack), "--minutes", "0"], "--minutes: wanted more than 0"),
     ):

@@ -17,6 +17,7 @@ from snarfcli.commands.train import TrainConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.fitting import PoseRefiner
+from snarfcli.native import backend
 from snarfcli.runs import run_folder
 from snarfcli.samples.store import SampleStore
 from snarfcli.training.trainer import Trainer
@@ -109,6 +110,14 @@ def test_an_interrupted_run_resumes_to_the_same_avatar(config, monkeypatch, capl
         run(replace(config, resume=True, seed=1))
     run(replace(config, overwrite=True, seed=1))
     assert (folder_of(config) / "avatar.pt").read_bytes() != before
+
+
+def test_a_backend_that_is_not_there_is_refused_before_anything_is_written(config, monkeypatch):
+    monkeypatch.setattr(backend, "why_no_kernels", lambda device: "it was not built")
+    chosen = replace(config, search=replace(config.search, backend="native"))
+    with pytest.raises(UserError, match=r"^backend native is not available: it was not built; "):
+        run(chosen)
+    assert not folder_of(chosen).exists()
 
 
 def test_an_interrupt_while_poses_are_finished_loses_nothing(config, monkeypatch):

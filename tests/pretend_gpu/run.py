@@ -10,7 +10,6 @@ import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 
-import pytest
 from pretend_gpu.build import build_library, why_no_pretend_gpu
 from pretend_gpu.seen import Seen
 
@@ -45,6 +44,8 @@ def run_on_pretend_gpu(code: str, *arguments: str | Path, emulated: bool = False
         AssertionError: the code failed; the message has its output.
     """
     if (reason := why_no_pretend_gpu()) is not None:
+        import pytest  # here, so that benchmarks need it only to skip nothing
+
         pytest.skip(reason)
     with tempfile.TemporaryDirectory() as folder:
         program, report = Path(folder) / "program.py", Path(folder) / "report.jsonl"

@@ -248,7 +248,7 @@ def test_a_step_that_is_not_finite_changes_nothing_and_is_told(store, monkeypatc
     assert all(torch.equal(*pair) for pair in zip(before, trainer.optimizer.tensors(), strict=True))
 
 
-def test_a_resumed_run_draws_the_same(store):
+def test_a_resumed_run_draws_the_same(store, caplog):
     whole, first = trainer_for(store, refresh_cells_every=5), trainer_for(store, refresh_cells_every=5)
     wanted = advance_to(whole, 14)
     advance_to(first, 8)
@@ -256,8 +256,10 @@ def test_a_resumed_run_draws_the_same(store):
     second.restore(first.state(), "checkpoint.pt")
     assert advance_to(second, 14) == pytest.approx(wanted[8:], rel=1e-5)
     on_the_host = trainer_for(store, refresh_cells_every=5, graph="off")
-    on_the_host.restore(first.state(), "checkpoint.pt")  # with other draws, as on a machine without a GPU
+    with caplog.at_level(logging.INFO):
+        on_the_host.restore(first.state(), "checkpoint.pt")  # as on a machine without a GPU
     assert on_the_host.step == 8
+    assert caplog.messages[-1].startswith("other random numbers than before from here on: ")
 
 
 def test_the_loop_reports_every_step_once(store, tmp_path):

@@ -1,7 +1,7 @@
 // Random bits that depend on a step and a place only (snarfcli/draws.py).
 //
-// DESIGN. One thread a number. Each hashes the step anew, in some thirty instructions, instead of reading the hash from memory. The
-// step is read from the device, so that a CUDA graph draws other numbers in every replay.
+// DESIGN. One thread a number. Each hashes the step anew, in some thirty instructions, instead of reading the hash from memory.
+// The step is read from the device, so that a CUDA graph draws other numbers in every replay.
 #include "snarf/platform.h"
 
 namespace snarf {

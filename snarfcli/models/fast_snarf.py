@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -18,6 +18,7 @@ from snarfcli.deformer.cells import corners_of
 from snarfcli.deformer.skinning import skin
 from snarfcli.deformer.weights import VoxelWeights
 from snarfcli.draws import Draws
+from snarfcli.models.occupied import OccupiedSamples, parts_of_cells, sample_cells
 from snarfcli.models.pieces import floating_cells
 from snarfcli.models.settings import AvatarConfig, ModelConfig
 from snarfcli.models.symmetry import find_mirror
@@ -26,8 +27,6 @@ from snarfcli.shape import OccupancyNetwork
 
 __all__ = ["FastSnarf", "FoundRoots", "blend"]
 
-_MOST_SAMPLES = 2**26
-_SAMPLES_M = 0.04  # largest distance between the samples of a cell; a wrist is 5 cm thick
 _KEPT_RADIUS_M = 0.1  # cells with a corner at most this far from a bone are always searched
 _GROWTH_M = 0.06  # margin of the cells searched in training around what might be occupied
 _GROWTH_LOGIT = -3.0  # logit that counts as "might be occupied" in training: 5 %
@@ -85,7 +84,7 @@ class FastSnarf(System):
         if config.model.blend not in ("logit", "probability"):
             raise ValueError(f"model.blend: wanted logit or probability, got {config.model.blend!r}")
         width, height, depth = config.skinning.resolution
-        _parts_of_cells(grid, (depth, height, width))
+        parts_of_cells(grid, (depth, height, width))
         skinning, bones, num_bones = config.skinning, bone_segments(skeleton), skeleton.num_joints
         active = kept = prior = None
         if skinning.bone_radius_m is not None:
@@ -161,12 +160,7 @@ class FastSnarf(System):
             reach_m: cells at most this far from an occupied sample, along each axis, are included, active or not.
             precision: of the shape network.
         """
-        near, finer = self._occupied_samples(pose, threshold, precision)
-        per_metre = near.new_tensor(finer[::-1]) / self.deformer.grid.cell_size(self.deformer.shape)
-        for axis, count in enumerate((reach_m * per_metre - 1e-3).ceil().long().clamp_min(0).tolist()[::-1]):
-            along = [count if axis == other else 0 for other in range(3)]
-            near = F.max_pool3d(near, [2 * n + 1 for n in along], 1, along)
-        return F.max_pool3d(near, [factor + 1 for factor in finer], finer)[0, 0] > 0
+        return self._occupied(pose, threshold, precision).touched_cells(reach_m)
 
     def extend_weights(self, pose: Tensor, precision: str = "highest") -> tuple[nn.Parameter, Tensor] | None:
         """Extend the skinning weights at nodes near the surface in the poses [P, J, 3] to all other nodes.
@@ -188,34 +182,16 @@ class FastSnarf(System):
 
         The shape is all that is occupied in any of the poses [P, J, 3]; cells are sampled as in `occupied_cells`.
         """
-        samples, finer = self._occupied_samples(pose, 0.0, precision)
-        window = [factor + 1 for factor in finer]
-        most, least = F.max_pool3d(samples, window, finer), -F.max_pool3d(-samples, window, finer)
-        return (most > least)[0, 0]
+        return self._occupied(pose, 0.0, precision).surface_cells()
 
-    def _occupied_samples(self, pose: Tensor, threshold: float, precision: str) -> tuple[Tensor, list[int]]:
-        """Return whether samples of active cells are occupied in any pose, and into how many parts they divide a cell's sides.
+    def _occupied(self, pose: Tensor, threshold: float, precision: str) -> OccupiedSamples:
+        """Return which samples of the active cells are occupied in any of the poses [P, J, 3]."""
+        weights = self.deformer.node_weights(active_only=True)
 
-        Returns:
-            Zeros and ones [1, 1, ...] on a lattice that has the grid's nodes and samples between them; and three numbers, along
-            z, y and x.
-        """
-        deformer = self.deformer
-        weights = deformer.node_weights(active_only=True)
-        finer = _parts_of_cells(deformer.grid, deformer.shape)
-        fine = deformer.active_cells
-        for axis, factor in enumerate(finer):
-            fine = fine.repeat_interleave(factor, axis)
-        left = corners_of(fine).reshape(-1).nonzero()[:, 0]  # samples that were not occupied in any pose so far
-        shape = [n + 1 for n in fine.shape]
-        places = deformer.grid.nodes(shape).reshape(-1, 3)
-        touched = torch.zeros(shape, dtype=torch.bool, device=places.device)
-        for condition in self.condition(pose):
-            seen = self._weights_seen(places[left], weights)
-            values = self._logits_in(condition, places[left], seen, precision)
-            touched.view(-1)[left[values > threshold]] = True
-            left = left[values <= threshold]
-        return touched[None, None].float(), finer
+        def logits_in(condition: Tensor, canonical: Tensor) -> Tensor:
+            return self._logits_in(condition, canonical, self._weights_seen(canonical, weights), precision)
+
+        return sample_cells(self.deformer, [partial(logits_in, condition) for condition in self.condition(pose)], threshold)
 
     def refresh_cells(self, pose: Tensor, precision: str = "highest") -> None:
         """Recompute the active cells from the current shape; called periodically in training.
@@ -252,7 +228,7 @@ class FastSnarf(System):
         """Stop searching cells that hold nothing but pieces which do not belong to the subject (see `floating_cells`)."""
         if self.search.name != "complete":
             return 0
-        samples, finer = self._occupied_samples(pose, 0.0, precision)
+        occupied = self._occupied(pose, 0.0, precision)
         lower, upper = self.deformer.lower, self.deformer.upper
         places, query, first = [lower.new_empty(0, 3)], [torch.empty(0, dtype=torch.long, device=lower.device)], 0
         for found, posed in inside:
@@ -262,9 +238,10 @@ class FastSnarf(System):
             places.append(roots.canonical[logits > 0])
             query.append(first + roots.query[logits > 0])
             first += roots.batch * roots.count
-        steps = lower.new_tensor([n - 1 for n in samples.shape[:1:-1]]) / (upper - lower)
+        steps = lower.new_tensor([n - 1 for n in occupied.samples.shape[:1:-1]]) / (upper - lower)
         lattice = (torch.cat(places) - lower) * steps
-        cells, dropped = floating_cells(samples[0, 0] > 0, finer, lattice, torch.cat(query), self.config.model.components)
+        is_occupied, wanted = occupied.samples[0, 0] > 0, self.config.model.components
+        cells, dropped = floating_cells(is_occupied, occupied.parts, lattice, torch.cat(query), wanted)
         left = self.deformer.active_cells & ~cells
         if not bool((cells & self.deformer.active_cells).any()) or not bool(left.any()):
             return 0
@@ -391,22 +368,6 @@ class FastSnarf(System):
             touched = self.occupied_cells(self._canonical_pose[None], reach_m=_SURFACE_MOVES_M)
             self._body_cells = touched if bool(touched.any()) else self.deformer.active_cells
         return self.deformer.posed_box(bone_transforms, self._body_cells)
-
-
-def _parts_of_cells(grid: CanonicalGrid, shape: tuple[int, int, int]) -> list[int]:
-    """Return into how many parts samples divide the sides of a cell, along z, y and x, for nodes `shape` = (D, H, W).
-
-    Raises:
-        ValueError: there are too many samples.
-    """
-    parts = [math.ceil(side / _SAMPLES_M) for side in grid.cell_size(shape).tolist()[::-1]]
-    samples = math.prod(part * (nodes - 1) for part, nodes in zip(parts, shape, strict=True))
-    if samples > _MOST_SAMPLES:
-        raise ValueError(
-            f"grid: wanted a canonical box of at most {_MOST_SAMPLES:,} cells of 4 cm, got one that is "
-            f"{grid.longest_side:.3g} m long; units are metres"
-        )
-    return parts
 
 
 def blend(logits: Tensor, found: Correspondences, config: ModelConfig) -> Tensor:

@@ -10,7 +10,7 @@ from snarfcli.avatar import Avatar
 from snarfcli.bodies import Skeleton
 from snarfcli.deformer import CanonicalGrid
 from snarfcli.deformer.grid import locate
-from snarfcli.models import fast_snarf
+from snarfcli.models.occupied import SAMPLES_M
 
 RADIUS = 0.07
 
@@ -154,7 +154,7 @@ def test_nothing_changes_where_all_is_to_be_searched_or_nothing_is_there(act):
 
 def test_samples_lie_close_enough():
     """At any resolution, samples of a cell are closer together than a thin part of a body."""
-    assert fast_snarf._SAMPLES_M <= 0.04
+    assert SAMPLES_M <= 0.04
     for resolution in ([6, 5, 4], [40, 30, 20]):
         avatar = capsule_avatar(resolution=resolution)
         inner = cells_of(avatar, capsule_points(0.03))

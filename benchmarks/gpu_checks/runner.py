@@ -106,7 +106,7 @@ def run_stages(
     Args:
         results: what is known; each stage is added as it ends.
         chosen: the stages.
-        command: returns the command of a stage, which writes its section to a path and has so many seconds.
+        command: takes a stage, the path of its section, and its time limit in seconds; returns the command to run.
         folder: for sections and outputs.
         seconds: time for all stages together; those for which too little is left are not begun.
         say: takes one line per stage.

@@ -6,8 +6,8 @@
 //                level. Runs once for each level, over the entries of all poses of the group.
 //   solve_parts  One thread takes one entry of a tame cell or part: Newton's method from one start. Of the parts that are still
 //                curved at the last level, one thread takes one start; what several starts report is dropped in shared memory.
-// All threads of a launch have about the same to do, whatever the poses and the queries are. Which thread takes which entry
-// depends on the order of time; what it computes does not. Only what a list has no room for is searched depth first by the
+// All threads of a launch do about the same amount of work, for any poses and queries. Which thread takes which entry may vary
+// between runs; what it computes does not. Only what a list has no room for is searched depth first by the
 // thread that found it.
 #include "parts.cuh"
 

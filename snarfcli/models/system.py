@@ -196,7 +196,7 @@ class System(nn.Module):
     # ---------------------------------------------------------------- training
     @property
     def has_fixed_shapes(self) -> bool:
-        """Whether no shape in a step depends on values if `find` gets a capacity, so that a step can be captured."""
+        """Whether all tensors of a step have shapes known in advance, given a capacity for `find`; needed for a capture."""
         return True
 
     def keep_room(self) -> None:

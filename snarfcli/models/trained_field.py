@@ -188,7 +188,7 @@ class TrainedField:
     def with_precision(self, precision: str) -> Self:
         """Return a copy whose shape network computes in another precision, and with it queries, meshes and exports.
 
-        It shares the model. On a CPU the native library computes in float32, whatever the precision.
+        The copy shares the model. On a CPU the native library always computes in float32.
 
         Args:
             precision: of products on a GPU: "highest" (float32), "high" or "medium" (TF32) or "bfloat16".

@@ -59,7 +59,7 @@ def has_ended(pid: str) -> bool:
             state = Path(f"/proc/{pid}/stat").read_text().split(") ")[-1][0]
         except OSError:
             return True
-        if state == "Z":  # nobody has waited for it
+        if state == "Z":  # ended; its parent has not collected the exit code
             return True
         time.sleep(0.05)
     return False

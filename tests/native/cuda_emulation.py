@@ -16,7 +16,7 @@ import torch
 
 from snarfcli.native.cuda_compile import cuda_sources
 
-__all__ = ["EmulatedGpu", "build_emulation", "host_compiler"]
+__all__ = ["EmulatedGpu", "build_emulation", "host_compiler", "require_compiler"]
 
 _FOLDER = Path(__file__).parent / "emulation"
 _NUMBERS = {torch.float32: "float", torch.float64: "double"}
@@ -70,6 +70,14 @@ def host_compiler() -> str | None:
     """Return a C++ compiler with GCC's command line, or None."""
     chosen = os.environ.get("CXX")
     return next((path for name in (chosen, "g++", "clang++", "c++") if name and (path := shutil.which(name))), None)
+
+
+def require_compiler() -> None:
+    """Skip the running test where there is no C++ compiler, without which the kernels cannot be emulated."""
+    if host_compiler() is None:
+        import pytest  # here, since benchmarks use the emulation too
+
+        pytest.skip("needs a C++ compiler")
 
 
 def build_emulation(dtype: torch.dtype, program: str = "emulation") -> ctypes.CDLL:

@@ -7,7 +7,7 @@ import inspect
 
 import pytest
 import torch
-from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
+from cuda_emulation import EmulatedGpu, build_emulation, require_compiler
 from ground_truth import true_roots
 from skinning_scenes import posed_queries, random_transforms, smooth_weights, unit_grid
 
@@ -66,15 +66,14 @@ class Runner:
 
 @pytest.fixture(params=["emulated", "cuda"] if HAS_GPU else ["emulated"])
 def runner(request):
-    if request.param == "emulated" and host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    if request.param == "emulated":
+        require_compiler()
     return Runner(request.param)
 
 
 @pytest.fixture
 def emulated():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     return Runner("emulated")
 
 

@@ -6,7 +6,7 @@ import ctypes
 
 import pytest
 import torch
-from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
+from cuda_emulation import EmulatedGpu, build_emulation, require_compiler
 from encoding_arrays import encoding_arrays
 from torch import Tensor
 
@@ -42,8 +42,8 @@ class Runner:
 
 @pytest.fixture(params=["emulated", "cuda"] if HAS_GPU else ["emulated"])
 def runner(request):
-    if request.param == "emulated" and host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    if request.param == "emulated":
+        require_compiler()
     return Runner(request.param)
 
 
@@ -69,8 +69,7 @@ def check(runner: Runner, arrays, gradient: Tensor | None = None) -> list[Tensor
 
 # ---------------------------------------------------------------- arguments
 def test_structures_and_constants_match_the_kernels():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     assert build_emulation(torch.float32).encoding_bytes() == ctypes.sizeof(cuda_encoding._Encoding) < 4096
     source = (cuda_compile.cuda_sources() / "cuda" / "encoding.cu").read_text()
     assert f"kEncodingLevels = {cuda_encoding.MAX_LEVELS};" in source
@@ -178,8 +177,7 @@ def test_arrays_may_be_strided_or_start_anywhere(runner):
 
 @pytest.mark.parametrize("block", [2, 7, 64])
 def test_the_number_of_threads_does_not_matter(block):
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     arrays = encoding_arrays(130)
     alone, together = check(Runner("emulated"), arrays), check(Runner("emulated", block), arrays)
     assert torch.equal(alone[0], together[0])
@@ -188,8 +186,7 @@ def test_the_number_of_threads_does_not_matter(block):
 
 # ---------------------------------------------------------------- launches
 def test_one_launch_each_way_and_none_without_points():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     for count, wants, launches in ((9, True, 2), (9, False, 1), (0, True, 0)):
         emulated, arrays = EmulatedGpu(torch.float32), encoding_arrays(count)
         encoded = run_encode(emulated, *arrays)

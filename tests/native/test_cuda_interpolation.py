@@ -6,7 +6,7 @@ import ctypes
 
 import pytest
 import torch
-from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
+from cuda_emulation import EmulatedGpu, build_emulation, require_compiler
 from torch import Tensor
 
 from snarfcli.deformer.grid import CanonicalGrid
@@ -34,8 +34,8 @@ class Runner:
 
 @pytest.fixture(params=["emulated", "cuda"] if HAS_GPU else ["emulated"])
 def runner(request):
-    if request.param == "emulated" and host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    if request.param == "emulated":
+        require_compiler()
     return Runner(request.param)
 
 
@@ -53,8 +53,7 @@ def wanted(values: Tensor, points: Tensor) -> Tensor:
 
 
 def test_structure_matches_the_kernel():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     assert build_emulation(torch.float32).interpolation_bytes() == ctypes.sizeof(cuda_interpolation._Interpolation)
 
 

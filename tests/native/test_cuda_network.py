@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
+from cuda_emulation import EmulatedGpu, build_emulation, require_compiler
 from torch.nn import functional as F
 
 from snarfcli.native import cuda_driver, cuda_network
@@ -92,8 +92,8 @@ class Runner:
 
 @pytest.fixture(params=["emulated", "cuda"] if torch.cuda.is_available() else ["emulated"])
 def runner(request):
-    if request.param == "emulated" and host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    if request.param == "emulated":
+        require_compiler()
     return Runner(request.param)
 
 
@@ -136,8 +136,7 @@ def wanted_of(config: ShapeConfig, inputs: tuple, precision: str = "highest") ->
 
 # ---------------------------------------------------------------- structures
 def test_structures_and_constants_match_the_kernels():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     library = build_emulation(torch.float32, "network")
     assert library.packing_bytes() == ctypes.sizeof(cuda_network._Packing)
     assert library.evaluation_bytes() == ctypes.sizeof(cuda_network._Evaluation)

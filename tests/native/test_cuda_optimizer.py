@@ -8,7 +8,7 @@ import itertools
 import pytest
 import torch
 from adam_arrays import DECAYS, EPSILON, AdamArrays, adam_arrays, are_equal, new_gradients
-from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
+from cuda_emulation import EmulatedGpu, build_emulation, require_compiler
 
 from snarfcli.native import cuda_compile, cuda_optimizer
 from snarfcli.native.cpu_optimizer import adam_step
@@ -51,8 +51,8 @@ class Runner:
 
 @pytest.fixture(params=["emulated", "cuda"] if HAS_GPU else ["emulated"])
 def runner(request):
-    if request.param == "emulated" and host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    if request.param == "emulated":
+        require_compiler()
     return Runner(request.param)
 
 
@@ -63,8 +63,7 @@ def on_the_host(run, arrays: AdamArrays, step: int, average_decay: float = 0.5) 
 
 # ---------------------------------------------------------------- arguments
 def test_structures_and_constants_match_the_kernels():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     library = build_emulation(torch.float32)
     assert library.optimizer_bytes() == ctypes.sizeof(cuda_optimizer._Launch) < 4096  # the limit before CUDA 12.1
     assert library.optimizer_task_bytes() == ctypes.sizeof(cuda_optimizer._Task)
@@ -125,8 +124,7 @@ def test_the_average_follows_quickly_at_first(runner):
 
 @pytest.mark.parametrize("block", [2, 7, 64])
 def test_the_number_of_threads_does_not_matter(block):
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     shapes = [(), (PART + 1,), (513, 4), (43, 24)]
     alone, together = adam_arrays(shapes, 4), adam_arrays(shapes, 4)
     rates, skips = [1.0, 2.0, 3.0, 1.0], [False, False, True, True]
@@ -186,8 +184,7 @@ def test_without_a_single_number_there_is_nothing_to_do(runner):
 # ---------------------------------------------------------------- launches
 @pytest.mark.parametrize("count", [1, 49, 50, 51, 120])
 def test_two_launches_for_up_to_fifty_arrays(count):
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     shapes = [(index % 5 + 1, 3) for index in range(count)]
     arrays, before, theirs = (adam_arrays(shapes, 11) for _ in range(3))
     emulated = EmulatedGpu(torch.float32)

@@ -6,7 +6,7 @@ import ctypes
 
 import pytest
 import torch
-from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
+from cuda_emulation import EmulatedGpu, build_emulation, require_compiler
 from torch import Tensor
 
 from snarfcli.native import cuda_compile, cuda_segments
@@ -33,8 +33,8 @@ class Runner:
 
 @pytest.fixture(params=["emulated", "cuda"] if HAS_GPU else ["emulated"])
 def runner(request):
-    if request.param == "emulated" and host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    if request.param == "emulated":
+        require_compiler()
     return Runner(request.param)
 
 
@@ -46,8 +46,7 @@ def points_and_segments(count: int) -> tuple[Tensor, Tensor]:
 
 
 def test_structure_and_constant_match_the_kernel():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     assert build_emulation(torch.float32).segment_bytes() == ctypes.sizeof(cuda_segments._Distance)
     source = (cuda_compile.cuda_sources() / "cuda" / "segments.cu").read_text()
     assert f"__launch_bounds__({BLOCK})" in source
@@ -87,7 +86,6 @@ def test_distances_of_strided_points(runner):
 
 @pytest.mark.parametrize("block", [2, 7, 64])
 def test_the_number_of_threads_does_not_matter(block):
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     arrays = points_and_segments(130)
     assert all(map(torch.equal, Runner("emulated")(*arrays), Runner("emulated", block)(*arrays)))

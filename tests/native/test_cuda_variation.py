@@ -6,7 +6,7 @@ import ctypes
 
 import pytest
 import torch
-from cuda_emulation import EmulatedGpu, build_emulation, host_compiler
+from cuda_emulation import EmulatedGpu, build_emulation, require_compiler
 from torch import Tensor
 
 from snarfcli.deformer.variation import variation, variation_reference
@@ -32,8 +32,8 @@ class Runner:
 
 @pytest.fixture(params=["emulated", "cuda"] if HAS_GPU else ["emulated"])
 def runner(request):
-    if request.param == "emulated" and host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    if request.param == "emulated":
+        require_compiler()
     return Runner(request.param)
 
 
@@ -46,8 +46,7 @@ def weights_and_used(shape: tuple[int, ...], share: float | None) -> tuple[Tenso
 
 # ---------------------------------------------------------------- arguments
 def test_structure_and_constant_match_the_kernels():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     assert build_emulation(torch.float32).variation_bytes() == ctypes.sizeof(cuda_variation._Variation)
     source = (cuda_compile.cuda_sources() / "cuda" / "variation.cu").read_text()
     assert f"kVariationThreads = {cuda_variation._THREADS};" in source
@@ -114,8 +113,7 @@ def test_variation_of_strided_weights(runner):
 # ---------------------------------------------------------------- launches
 @pytest.mark.parametrize("block", [2, 7, 64])
 def test_the_number_of_threads_changes_no_gradient(block):
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     for share in (None, 0.6):
         weights, used = weights_and_used((3, 4, 7, 5), share)
         one, many = Runner("emulated")(weights, used), Runner("emulated", block)(weights, used)
@@ -134,8 +132,7 @@ def test_blocks_take_turns_when_there_are_many_weights(runner, monkeypatch):
 
 
 def test_pairs_are_counted_only_where_nodes_are_left_out():
-    if host_compiler() is None:
-        pytest.skip("needs a C++ compiler")
+    require_compiler()
     for share, launches in ((0.5, 3), (None, 2)):
         emulated = EmulatedGpu(torch.float32)
         weights, used = weights_and_used((2, 3, 4, 5), share)

@@ -15,7 +15,7 @@ import torch
 
 from snarfcli.devices import gpus_in_turn, why_no_gpu, why_unusable
 from snarfcli.errors import UserError, nearest
-from snarfcli.versions import recorded_versions
+from snarfcli.versions import recorded_code, recorded_versions
 
 __all__ = ["check_device", "choose_device", "find_avatar", "machine_facts", "run_folder", "seed_everything", "set_threads"]
 
@@ -121,7 +121,7 @@ def seed_everything(seed: int) -> None:
 
 
 def machine_facts(device: torch.device | None = None) -> dict[str, Any]:
-    """Return the versions and the machine of a result, as `versions` and `machine`.
+    """Return the versions, the code and the machine of a result, as `versions`, `code` and `machine`.
 
     Args:
         device: device that computed the result, if a GPU can have done so.
@@ -130,7 +130,7 @@ def machine_facts(device: torch.device | None = None) -> dict[str, Any]:
     machine["threads"] = torch.get_num_threads()
     if device is not None and device.type == "cuda":
         machine["gpu"] = torch.cuda.get_device_name(device)
-    return {"versions": recorded_versions(), "machine": machine}
+    return {"versions": recorded_versions(), "code": recorded_code(), "machine": machine}
 
 
 def _processor() -> str:

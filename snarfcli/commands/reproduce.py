@@ -36,9 +36,12 @@ __all__ = ["ReproduceConfig", "resolve_training", "run"]
 
 log = logging.getLogger(__name__)
 
-# Settings that do not change the avatar, or only name the run.
+# Settings that do not change the avatar, or only name the run; the second are those of `training`.
 _NOT_OF_THE_AVATAR = (
     "subject", "seed", "run", "data_root", "output_root", "resume", "overwrite", "wait", "device", "threads",
+)  # fmt: skip
+_NOT_OF_THE_AVATAR_IN_TRAINING = (
+    "workers", "graph", "validate_every", "validation_frames", "validation_ood_frames", "checkpoint_every",
 )  # fmt: skip
 
 
@@ -164,8 +167,8 @@ def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
             GlobalHydra.instance().initialize(running)
     for name in _NOT_OF_THE_AVATAR:
         config.pop(name)
-    for name in ("workers", "graph"):
-        config["training"].pop(name, None)
+    for name in _NOT_OF_THE_AVATAR_IN_TRAINING:
+        config["training"].pop(name)
     return config
 
 

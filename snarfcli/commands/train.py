@@ -76,6 +76,8 @@ def _prepare(config: TrainConfig, folder: Path, device: torch.device) -> Trainer
     store = SampleStore.open(config.data_root, config.data.name, config.subject)
     sequences = store.sequences("train")
     frames = sum(len(sequence.train_frames) for sequence in sequences)
+    if config.training.validation_ood_frames:
+        store.sequences("ood")  # raises if there are none
     log.info("data: %s, subject %s, %d sequences, %d frames to train on", store.data, store.subject, len(sequences), frames)
     if config.search.backend == "native":
         choose_backend("native", device)  # raises before anything is written
@@ -225,6 +227,7 @@ def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seco
         "iou_surface": validation.get("iou_surface"),
         "frames": min(config.training.validation_frames, held_back),
         "steps": trainer.step,
+        "validations": trainer.validations,
         "refined_poses": None if trainer.refiner is None else trainer.refiner.poses.summary(),
         "timings": {"wall_s": round(seconds, 2)} | {k: v for k, v in result.items() if k != "validation"},
         **machine_facts(trainer.device),

@@ -26,7 +26,7 @@ _AT_LEAST_ONE = (
 )  # fmt: skip
 _NOT_NEGATIVE = (
     "uniform_points", "surface_points", "far_points", "warmup_steps", "bootstrap_steps", "bone_occupancy_weight",
-    "joint_weight", "validation_frames", "refresh_cells_every", "extend_weights_every", "workers",
+    "joint_weight", "validation_frames", "validation_ood_frames", "refresh_cells_every", "extend_weights_every", "workers",
     "agreement_weight",
 )  # fmt: skip
 _LEAST_OF_MODEL = {"part_width": 1, "part_depth": 1, "part_code": 0, "part_weight": 0, "part_points": 1, "components": 1}

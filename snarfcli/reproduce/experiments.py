@@ -75,7 +75,7 @@ _NASA = Row("nasa", "NASA", ("model=nasa", *_PAPERS), _NETWORKS, "nasa")
 # code) and an eighth of the points it takes 0.4 s.
 _SNARF_LIGHT = (
     *_NETWORKS, "search=broyden", "training.poses_per_step=2", "training.uniform_points=150", "training.surface_points=450",
-    "training.far_points=50",
+    "training.far_points=50", "training.validate_every=600",
 )  # fmt: skip
 _SNARF = Row("snarf", "SNARF", ("model=snarf", *_PAPERS), _SNARF_LIGHT, "snarf")
 _SNARF_NOTE = (

@@ -26,6 +26,9 @@ __all__ = ["choose_experiments", "make_plan"]
 # The out-of-distribution poses of DFaust's subjects are another data set: PosePrior's motion on their bodies.
 _OTHER_OOD_DATA = {"dfaust": "poseprior"}
 _PARITY_FOLDER = "parity"
+# For the curves of a training: its number of validations, and of frames out of distribution in each.
+_VALIDATIONS = 6
+_VALIDATION_OOD_FRAMES = 8
 # Settings of a training that the plan sets, and the setting of `snarf reproduce` to give instead.
 _OWN_SETTINGS = {
     "subject": "subjects=[...]", "seed": "seeds=[...]", "run": "no name: runs are named after their row", "data": "data=NAME",
@@ -136,8 +139,10 @@ def _job(
     train_root = root if row.inside_test == "winding" else str(Path(root) / _PARITY_FOLDER)
     machine = (f"device={options.device}", *((f"threads={options.threads}",) if options.threads else ()))
     where = (_text("output_root", options.output_root), f"run={name}")
+    settings = (*row.settings(training), *options.extra)
     train = (
-        "train", f"subject={quote(subject)}", f"data={data}", f"training={training}", *row.settings(training), *options.extra,
+        "train", f"subject={quote(subject)}", f"data={data}", f"training={training}",
+        *_curve_settings(data, resolved["training"]["steps"], settings), *settings,
         f"seed={seed}", _text("data_root", train_root), *where, *machine, "resume=true",
     )  # fmt: skip
     return Job(
@@ -152,6 +157,15 @@ def _job(
         evaluations=_evaluation_stages(data, subject, folder, options, where, machine),
         digest=_digest([resolved, seed, data, subject, row.inside_test]),
     )
+
+
+def _curve_settings(data: str, steps: int, settings: Sequence[str]) -> tuple[str, ...]:
+    """Return settings with which a training measures its IoU now and then, in and out of distribution; given ones stay."""
+    curve = {"training.validate_every": max(1, steps // _VALIDATIONS)}
+    if data not in _OTHER_OOD_DATA:
+        curve["training.validation_ood_frames"] = _VALIDATION_OOD_FRAMES
+    given = {setting.partition("=")[0] for setting in settings}
+    return tuple(f"{name}={value}" for name, value in curve.items() if name not in given)
 
 
 def _samples_stages(data: str, subject: str, root: str, train_root: str, inside_test: str) -> tuple[SamplesStage, ...]:

@@ -12,12 +12,20 @@ from snarfcli.models.settings import AvatarConfig
 from snarfcli.texts import one_line
 from snarfcli.training.settings import TrainingConfig
 
-__all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "check_same_settings", "checked_seconds", "checked_step"]
+__all__ = [
+    "CHECKPOINT_FORMAT",
+    "CHECKPOINT_VERSION",
+    "check_same_settings",
+    "checked_seconds",
+    "checked_step",
+    "checked_validations",
+]
 
 CHECKPOINT_FORMAT = "snarf-checkpoint"
 CHECKPOINT_VERSION = 2
 
-_OF_THE_MACHINE = ("workers", "graph")  # settings with which a training may continue on another one
+# Settings that do not change the avatar, so that a training may continue with other values.
+_MAY_DIFFER = ("workers", "graph", "validate_every", "validation_frames", "validation_ood_frames", "checkpoint_every")
 
 
 def check_same_settings(state: dict[str, Any], avatar: AvatarConfig, training: TrainingConfig, seed: int, path: str) -> None:
@@ -27,7 +35,7 @@ def check_same_settings(state: dict[str, Any], avatar: AvatarConfig, training: T
         UserError: they differ, or there are none.
     """
     settings = asdict(training)
-    same = {name: settings[name] for name in _OF_THE_MACHINE}
+    same = {name: settings[name] for name in _MAY_DIFFER}
     ours = asdict(avatar) | {"training": settings, "seed": seed}
     try:
         theirs = state["avatar"]["config"] | {"training": state["training"] | same, "seed": state["seed"]}
@@ -58,6 +66,23 @@ def checked_seconds(seconds: Any) -> float:
     if type(seconds) not in (int, float) or not 0 <= seconds < math.inf:
         raise ValueError("seconds: wanted a number from 0, got another")
     return float(seconds)
+
+
+def checked_validations(validations: Any) -> list[dict[str, float]]:
+    """Return the validations in a checkpoint; ValueError if they are none."""
+    if not isinstance(validations, list):
+        raise ValueError("validations: wanted a list, got another type")
+    for one in validations:
+        names = ("step", "seconds", "iou_bbox", "iou_surface")
+        if not isinstance(one, dict) or not all(_is_number(one.get(name)) for name in names):
+            raise ValueError("validations: wanted finite numbers by name, got something else")
+        if not all(type(name) is str and _is_number(value) for name, value in one.items()):
+            raise ValueError("validations: wanted finite numbers by name, got something else")
+    return validations
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
 
 
 def _differences(theirs: Any, ours: Any, prefix: str = "") -> list[str]:

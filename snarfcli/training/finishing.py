@@ -15,12 +15,16 @@ from snarfcli.evaluation.metrics import iou
 from snarfcli.fitting import PoseRefiner
 from snarfcli.models.system import Found
 from snarfcli.models.trained_field import TrainedField
+from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.samples.store import SampleStore
 from snarfcli.training.batches import FrameBatches, load_frames
 
 __all__ = ["averaged", "drop_needless", "validate"]
 
 log = logging.getLogger(__name__)
+
+Frames = list[tuple[SequenceSamples, int]]
+"""Frames of sequences."""
 
 _STEPS_OF_SUPPORT = 12  # whose inside points show which pieces of the shape belong to the subject
 _POSES_AT_THE_END = 24  # number of training poses from which the searched cells of the finished avatar follow
@@ -60,8 +64,9 @@ def _found_inside(avatar: TrainedField, batches: FrameBatches, step: int) -> tup
     return avatar.find(points, batch.bone_transforms, batch.pose), batch.pose
 
 
-@torch.no_grad()
-def validate(avatar: TrainedField, store: SampleStore, most_frames: int, refiner: PoseRefiner | None) -> dict[str, float]:
+def validate(
+    avatar: TrainedField, store: SampleStore, most_frames: int, refiner: PoseRefiner | None, most_ood_frames: int = 0
+) -> dict[str, float]:
     """Return the IoU of an avatar on held-back frames of the training sequences, uniform and near-surface.
 
     Args:
@@ -69,10 +74,28 @@ def validate(avatar: TrainedField, store: SampleStore, most_frames: int, refiner
         store: processed samples.
         most_frames: number of frames, evenly spaced.
         refiner: refines the poses of these frames first; None leaves them as they are.
+        most_ood_frames: number of out-of-distribution frames, evenly spaced, whose IoU is returned too.
+
+    Raises:
+        UserError: out-of-distribution frames are wanted, and the store has none.
     """
-    frames = [(sequence, int(f)) for sequence in store.sequences("train") for f in sequence.val_frames]
-    count = min(most_frames, len(frames))
-    frames = [frames[index] for index in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    frames = [(sequence, int(frame)) for sequence in store.sequences("train") for frame in sequence.val_frames]
+    found = _mean_iou(avatar, _evenly(frames, most_frames), refiner)
+    if most_ood_frames:
+        frames = [(sequence, frame) for sequence in store.sequences("ood") for frame in range(sequence.num_frames)]
+        found |= {f"ood_{name}": value for name, value in _mean_iou(avatar, _evenly(frames, most_ood_frames), None).items()}
+    return found
+
+
+def _evenly(frames: Frames, most: int) -> Frames:
+    """Return at most `most` of some frames, evenly spaced."""
+    count = min(most, len(frames))
+    return [frames[index] for index in np.linspace(0, len(frames) - 1, count).round().astype(int)]
+
+
+@torch.no_grad()
+def _mean_iou(avatar: TrainedField, frames: Frames, refiner: PoseRefiner | None) -> dict[str, float]:
+    """Return the mean IoU over frames, of every second point; nothing without frames."""
     if refiner is not None:
         refiner.refine_all(avatar, frames, desc="validate: refine poses")
     values = []

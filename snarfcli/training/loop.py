@@ -13,7 +13,7 @@ from snarfcli.files import write_tensors
 from snarfcli.interrupts import interrupts_noted
 from snarfcli.progress import progress_bar
 from snarfcli.training.numbers import History
-from snarfcli.training.schedule import learning_rate
+from snarfcli.training.schedule import is_due, learning_rate
 from snarfcli.training.trainer import Trainer
 
 __all__ = ["train"]
@@ -46,6 +46,8 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
     validation: dict[str, float] = {}
     points_per_step = config.poses_per_step * (config.uniform_points + config.surface_points)
     paused = 0.0
+    if is_due(first_step, config.validate_every) and not any(one["step"] == first_step for one in trainer.validations):
+        trainer.validate()  # the run was interrupted between a checkpoint and this validation
 
     bar = progress_bar(total=config.steps, done=first_step, desc="train", unit="step")
     with closing(trainer.batches), interrupts_noted(_tell_of_interrupt) as interrupt, bar as shown:

@@ -69,5 +69,7 @@ class TrainingConfig:
     """Steps between two validations."""
     validation_frames: int = MISSING
     """Number of held-back frames per validation."""
+    validation_ood_frames: int = 0
+    """Number of out-of-distribution frames that a validation measures too, for curves; nothing depends on them."""
     checkpoint_every: int = MISSING
     """Steps between two checkpoints."""

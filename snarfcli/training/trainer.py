@@ -27,6 +27,7 @@ from snarfcli.training.checkpoints import (
     check_same_settings,
     checked_seconds,
     checked_step,
+    checked_validations,
 )
 from snarfcli.training.device_steps import DeviceSteps, choose_batches
 from snarfcli.training.finishing import averaged, drop_needless, validate
@@ -94,6 +95,8 @@ class Trainer:
         """The coming step. Where steps run ahead of the host it may fall back in `settle`, as steps are taken again."""
         self.seconds = 0.0
         """Time that the steps have taken, in all parts of the run."""
+        self.validations: list[dict[str, float]] = []
+        """The validations so far: `step`, `seconds` of training, and the numbers of `validate`."""
 
     def advance(self) -> StepNumbers:
         """Take one step, or start it on a device, and return its losses and counts, which are read when they are asked for.
@@ -230,8 +233,18 @@ class Trainer:
         return avatar
 
     def validate(self) -> dict[str, float]:
-        """Return the IoU of the averaged avatar on held-back frames of the training sequences, uniform and near-surface."""
-        return validate(self.averaged_avatar(), self.store, self.config.validation_frames, self.refiner)
+        """Return the IoU of the averaged avatar, uniform and near-surface, and add it to `validations`.
+
+        It is measured on held-back frames of the training sequences and, if the settings say so, out of distribution.
+        """
+        config = self.config
+        found = validate(
+            self.averaged_avatar(), self.store, config.validation_frames, self.refiner, config.validation_ood_frames
+        )
+        self.validations = [one for one in self.validations if one["step"] < self.step]  # a resumed run validates again
+        if found:
+            self.validations.append({"step": self.step, "seconds": round(self.seconds, 2)} | found)
+        return found
 
     def state(self) -> dict[str, Any]:
         """Return all state on which the coming steps depend, as plain dicts and tensors; waits for steps that were started.
@@ -245,6 +258,7 @@ class Trainer:
             "version": CHECKPOINT_VERSION,
             "step": self.step,
             "seconds": self.seconds,
+            "validations": self.validations,
             "seed": self.seed,
             "avatar": self.avatar.to_dict(),
             "training": asdict(self.config),
@@ -270,6 +284,7 @@ class Trainer:
             if self._ahead is not None:
                 self._ahead.follow()
             self.seconds = checked_seconds(state.get("seconds", 0.0))
+            self.validations = checked_validations(state.get("validations", []))
             if state.get("draws_on_device", self._ahead is not None) != (self._ahead is not None):
                 log.info("other random numbers than before from here on: training.graph or the device has changed")
         except (LookupError, RuntimeError, TypeError, ValueError, AttributeError) as error:

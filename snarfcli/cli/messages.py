@@ -6,7 +6,7 @@ import errno
 import re
 import sys
 
-from snarfcli.errors import UserError, is_out_of_memory, nearest
+from snarfcli.errors import LOST_DRIVE, UserError, is_out_of_memory, nearest
 from snarfcli.hydra_config.launchers import PLUGIN_LAUNCHERS, missing_plugin
 from snarfcli.texts import one_line
 
@@ -61,7 +61,7 @@ def _chain(error: BaseException) -> list[BaseException]:
 def _file_message(error: OSError) -> str:
     """Return what went wrong with a file, and the next step."""
     name = error.filename2 or error.filename or "a file"
-    advice = {
+    advice = dict.fromkeys(LOST_DRIVE, "the network drive does not answer; try again when it does") | {
         errno.ENOSPC: "the disk is full; free some space, then run the command again: it continues where it stopped",
         errno.EDQUOT: "the disk quota is used up; free some space, then run the command again",
         errno.EACCES: _NO_PERMISSION,

@@ -44,6 +44,8 @@ tell("start")
 actions = json.loads((folder / "actions.json").read_text())[number]
 action, _, of = actions[min(base["tries"], len(actions)) - 1].partition(" ")
 if action == "break":
+    if of:
+        os.kill(os.getpid(), getattr(signal, of))
     print("cannot start")
     sys.exit(1)
 write({"state": "running"})
@@ -81,7 +83,7 @@ class FakeJobs:
             monkeypatch: pytest's.
             actions: for each job what it does in its first, second, ... try: done, "after N" (done when job N has ended),
                 "meet N M ..." (done when those have begun), "fail RETRY", "signal NAME" (is ended by it), stop (waits until
-                it is asked to), hang, or break (does not begin).
+                it is asked to), hang, or "break" or "break NAME" (ends before it begins).
         """
         self.folder = folder
         write_json(folder / "actions.json", {str(number): list(of_job) for number, of_job in actions.items()})

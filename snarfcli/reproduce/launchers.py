@@ -156,11 +156,11 @@ class LocalProcesses:
             return
         log = self._log_of(number)
         reason = reason_of(log, 0, code)
-        if not has_results(self._work):
+        retry = retry_of(code, reason)
+        if not (retry or has_results(self._work)):
             raise UserError(f"launcher=local started no job: {reason}; see {log}")
         tries = 1 if before is None else before.tries + 1
-        retry = retry_of(code, reason) if tries == 1 else ""
-        status = JobStatus("failed", stage="reproduce", reason=reason, tries=tries, retry=retry)
+        status = JobStatus("failed", stage="reproduce", reason=reason, tries=tries, retry=retry if tries == 1 else "")
         write_result(self._work, number, status)
 
 

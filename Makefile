@@ -75,6 +75,7 @@ bench: $(INSTALLED)
 	$(VENV)/bin/python benchmarks/bm_library.py
 	$(VENV)/bin/python benchmarks/bm_data.py
 	$(VENV)/bin/python benchmarks/bm_training.py
+	$(VENV)/bin/python benchmarks/bm_threads.py
 	$(VENV)/bin/python benchmarks/bm_optimizer.py
 	$(VENV)/bin/python benchmarks/bm_gpu_waits.py
 	$(VENV)/bin/python benchmarks/bm_evaluation.py

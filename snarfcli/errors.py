@@ -7,9 +7,15 @@ import errno
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["UserError", "is_out_of_memory", "nearest", "raise_system_error"]
+__all__ = ["LOST_DRIVE", "UserError", "is_out_of_memory", "nearest", "raise_system_error"]
 
 _WRONG_PLACE = (None, errno.EINVAL, errno.EOVERFLOW)  # of a seek to where the content of a damaged file says
+
+LOST_DRIVE = (
+    errno.ESTALE, errno.EIO, errno.ETIMEDOUT, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH,
+    errno.ENOTCONN,
+)  # fmt: skip
+"""What a network drive answers that cannot be reached, or has lost a file; it may be back later."""
 
 
 class UserError(ValueError):

@@ -304,7 +304,7 @@ def planned_job() -> Target:
 
     from tree_damage import damaged_json
 
-    from snarfcli.reproduce.launching import read_planned_job
+    from snarfcli.reproduce.planned_jobs import read_planned_job
 
     seeds = [json.dumps({"slots": slots, "jobs": [asdict(_planned())]}).encode() for slots in (None, 2)]
     return Target("planned_job", ".json", lambda: seeds, lambda path: read_planned_job(path, 0), damaged_json)

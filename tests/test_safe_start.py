@@ -17,10 +17,11 @@ from snarfcli import safe_start
 from snarfcli.commands import preprocess
 from snarfcli.commands.preprocess import PreprocessConfig
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.hydra_config.launchers import is_installed
 from snarfcli.parallel import run_in_processes
-from snarfcli.reproduce import launching
 from snarfcli.reproduce.jobs import run_command
-from snarfcli.reproduce.launching import Launcher, launch
+from snarfcli.reproduce.launchers import Launcher
+from snarfcli.reproduce.launching import launch
 from snarfcli.safe_start import safe_environment, safe_imports, snarf_command
 
 NAMES = ("signal", "struct", "pickle", "json", "random", "multiprocessing", "socket", "torch", "numpy", "hydra", "snarfcli")
@@ -82,14 +83,14 @@ def test_preprocess(imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not imported.exists()
 
 
-@pytest.mark.parametrize("name", ["basic", "joblib"])
+@pytest.mark.parametrize("name", ["local", "joblib"])
 def test_jobs_of_reproduce(name: str, imported: Path, tmp_path: Path) -> None:
-    if name == "joblib" and (sys.version_info < (3, 11) or not launching.is_installed(name)):
+    if name == "joblib" and (sys.version_info < (3, 11) or not is_installed(name)):
         pytest.skip("hydra-joblib-launcher is not installed, or Python lacks PYTHONSAFEPATH")
     jobs = fake_plan(tmp_path, systems=("snarf", "nasa")).jobs
     for job in jobs:  # all results exist, so that only the processes are tested
         fake_run(job, {"id": 0.9, "ood": 0.8})
-    statuses = launch(jobs, tmp_path / "work", Launcher(name, 2 if name == "joblib" else 1), lambda *_: None)
+    statuses = launch(jobs, tmp_path / "work", Launcher(name, 2), lambda *_: None)
     assert [status and status.state for status in statuses] == ["done", "done"]
     assert not imported.exists()
 

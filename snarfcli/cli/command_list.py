@@ -105,7 +105,7 @@ COMMAND_LIST = (
         "reproduce_job",
         "reproduce_job",
         "ReproduceJobConfig",
-        "one run of a plan; called by Hydra's launchers",
+        "one run of a plan; called by snarf reproduce",
         "snarf reproduce_job plan=plan.json job=0",
         {},
         folder="reproduce",

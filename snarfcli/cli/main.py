@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import snarfcli
@@ -21,7 +19,6 @@ from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 from snarfcli.interrupts import exit_code, signals_as_interrupts
-from snarfcli.slots import SLOT_VARIABLE, use_slot
 
 __all__ = ["COMMANDS", "Command", "main"]
 
@@ -152,48 +149,39 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
     import hydra  # Hydra takes a third of a second, which --help does not need
     from omegaconf import OmegaConf
 
-    codes: list[int] = []
+    from snarfcli.cli.multirun import NOTE_FOLDER, ExitCodes, lost_job, slot_of_job
+
+    codes = ExitCodes()
 
     def job(config: Any) -> None:
         missing = sorted(OmegaConf.missing_keys(config))
         try:
             if missing:
                 raise UserError(f"{', '.join(missing)}: wanted a value, got none; give {missing[0]}=VALUE")
-            with _slot_of_job():
-                codes.append(run(expand_home(OmegaConf.to_object(config))) or 0)
+            with slot_of_job():
+                code = run(expand_home(OmegaConf.to_object(config))) or 0
         except Exception as error:  # reported here, not by Hydra; the next job of a multirun still runs
-            codes.append(_report(command, error))
+            code = _report(command, error)
+        codes.add(code)
 
     folder = str(config_folder() / command.folder)
     entry: Callable[[], None] = hydra.main(version_base="1.3", config_path=folder, config_name=command.name)(job)
     # Makes Hydra raise errors of the configuration, which `main` reports, instead of printing them and ending the process.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     before = sys.argv
-    sys.argv = [f"snarf {command.name}", *_HYDRA_SETTINGS, *overrides]
+    sys.argv = [f"snarf {command.name}", *_HYDRA_SETTINGS, NOTE_FOLDER, *overrides]
     try:
         entry()
+    except Exception as error:
+        if (lost := lost_job(error)) is not None:
+            raise UserError(lost) from error
+        raise
     finally:
         sys.argv = before
-    return max(codes, default=0)
-
-
-@contextmanager
-def _slot_of_job() -> Iterator[None]:
-    """Give a job of a multirun the lowest number that no other running job has, so that they use different GPUs.
-
-    A slot that the user has given to the whole call stays.
-    """
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
-
-    from snarfcli.locks import hold_slot
-
-    hydra = HydraConfig.get()
-    if hydra.mode != RunMode.MULTIRUN or SLOT_VARIABLE in os.environ:
-        yield
-        return
-    with hold_slot(Path(hydra.sweep.dir)) as slot, use_slot(slot):
-        yield
+        failure = codes.collect()
+    if failure:
+        print_error(f"snarf {command.name}: {failure}")
+    return codes.highest()
 
 
 def _shown() -> list[str]:

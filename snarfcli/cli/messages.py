@@ -6,7 +6,8 @@ import errno
 import re
 import sys
 
-from snarfcli.errors import UserError, is_out_of_memory
+from snarfcli.errors import LOST_DRIVE, UserError, is_out_of_memory, nearest
+from snarfcli.hydra_config.launchers import PLUGIN_LAUNCHERS, missing_plugin
 from snarfcli.texts import one_line
 
 __all__ = ["user_message"]
@@ -29,6 +30,8 @@ def _message(error: BaseException) -> str | None:
     for link in chain:
         if isinstance(link, UserError):
             return one_line(link)  # the name of its type, if it has no message
+    if "hydra" in sys.modules and (option := _option_message(chain)):
+        return option
     for link in chain:
         if isinstance(link, OSError) and not isinstance(link, (ConnectionError, ChildProcessError)):
             return _file_message(link)
@@ -58,7 +61,7 @@ def _chain(error: BaseException) -> list[BaseException]:
 def _file_message(error: OSError) -> str:
     """Return what went wrong with a file, and the next step."""
     name = error.filename2 or error.filename or "a file"
-    advice = {
+    advice = dict.fromkeys(LOST_DRIVE, "the network drive does not answer; try again when it does") | {
         errno.ENOSPC: "the disk is full; free some space, then run the command again: it continues where it stopped",
         errno.EDQUOT: "the disk quota is used up; free some space, then run the command again",
         errno.EACCES: _NO_PERMISSION,
@@ -84,6 +87,22 @@ def _memory_message(error: BaseException) -> str:
         return "not enough memory on the GPU; end other programs that use it, choose smaller sizes, or give device=cpu"
     own = one_line(error, 300) if isinstance(error, MemoryError) and str(error) else ""
     return own if ";" in own else "not enough memory; close other programs, or choose smaller sizes"
+
+
+def _option_message(chain: list[BaseException]) -> str | None:
+    """Return one line for an option that a group of Hydra lacks, such as hydra/launcher=NAME; None for other errors."""
+    from hydra.errors import MissingConfigException
+
+    for link in chain:
+        if isinstance(link, MissingConfigException):
+            group, _, option = str(link.missing_cfg_file).rpartition("/")
+            known = set(link.options or ())
+            if group == "hydra/launcher":
+                if (what_to_install := missing_plugin(option, group)) is not None:
+                    return what_to_install
+                known |= {*PLUGIN_LAUNCHERS}
+            return f"there is no {group}={option}{nearest(option, known)}; choose from {', '.join(sorted(known))}"
+    return None
 
 
 def _config_message(chain: list[BaseException]) -> str:

@@ -22,9 +22,9 @@ from snarfcli.files import remove_temporaries
 from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 from snarfcli.output_locks import hold_output
-from snarfcli.parallel import count_cores
 from snarfcli.reproduce.jobs import JobStatus, read_status
-from snarfcli.reproduce.launching import LAUNCHERS, Launcher, check_launcher, launch
+from snarfcli.reproduce.launchers import LAUNCHERS, Launcher
+from snarfcli.reproduce.launching import check_launcher, default_processes, launch
 from snarfcli.reproduce.planning import choose_experiments, make_plan
 from snarfcli.reproduce.plans import ExperimentOptions, Job, Plan, unique_jobs
 from snarfcli.reproduce.report import write_report
@@ -70,13 +70,13 @@ class ReproduceConfig:
     report: str | None = MISSING
     """Folder for tables and figures; null for <output_root>/reproduce/<what>."""
     launcher: str = MISSING
-    """basic (one after the other), joblib, submitit_local or submitit_slurm."""
-    processes: int = MISSING
-    """Number of jobs at a time; on a cluster the maximum."""
+    """local (processes of this machine), or with a launcher of Hydra joblib, submitit_local or submitit_slurm."""
+    processes: int | None = MISSING
+    """Number of jobs at a time; null for one per GPU or core, as far as memory allows, or on a cluster for all jobs."""
     launcher_settings: list[str] = MISSING
     """Settings of Hydra's launcher, such as [partition=gpu,gpus_per_node=1]."""
     threads: int | None = MISSING
-    """Threads per job; null divides the cores among the processes."""
+    """Threads per job; null shares the cores of this machine out among the jobs that run, or follows OMP_NUM_THREADS."""
     device: str = MISSING
     """auto, cpu, cuda or cuda:N."""
     max_frames: int | None = MISSING
@@ -100,15 +100,17 @@ def run(config: ReproduceConfig) -> int:
         UserError: an option is unknown or cannot be used; nothing has been run.
         OSError: a folder cannot be written to, or the disk is full.
     """
-    launcher = _check(config)
+    _check(config)
     choice = ExperimentOptions(
         subjects=tuple(config.subjects), seeds=tuple(config.seeds), training=config.training, data=config.data,
         systems=tuple(config.systems), extra=tuple(config.extra), data_root=config.data_root,
-        output_root=config.output_root, threads=launcher.threads, device=config.device, max_frames=config.max_frames,
+        output_root=config.output_root, threads=config.threads, device=config.device, max_frames=config.max_frames,
         surface_frames=config.surface_frames,
     )  # fmt: skip
     plans = [make_plan(one, part, resolve_training) for one, part in choose_experiments(config.what, choice)]
     jobs = unique_jobs(plans)
+    processes = config.processes or default_processes(config.launcher, len(jobs), config.device)
+    launcher = Launcher(config.launcher, processes, config.threads, tuple(config.launcher_settings))
     if config.dry_run:
         _print_plan(jobs)
         return 0
@@ -116,8 +118,8 @@ def run(config: ReproduceConfig) -> int:
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)  # fails before the work if it cannot be written
     if not config.only_report:
-        log.info("%d runs, launcher %s, %d at a time", len(jobs), launcher.name, launcher.processes)
-        progress = _Progress(jobs, launcher.processes)
+        log.info("%d runs, launcher %s, %d at a time", len(jobs), config.launcher, processes)
+        progress = _Progress(jobs, processes)
         try:
             launch(jobs, Path(config.output_root) / "reproduce" / "jobs", launcher, progress)
         except KeyboardInterrupt:
@@ -132,7 +134,7 @@ def run(config: ReproduceConfig) -> int:
         if undone:
             log.warning("warning: %d of %d runs are not done, so the exit code is 1; the report says why", undone, len(of_plan))
         resolution = config.figure_resolution if config.figures else None
-        about = f"{launcher.processes} runs at a time" if launcher.processes > 1 else ""
+        about = f"{processes} runs at a time" if processes > 1 and not config.only_report else ""
         with hold_output(folder, "snarf reproduce", wait=True):
             remove_temporaries(folder, recursive=True)
             written = write_report(plan, of_plan, folder, _command(config), about=about, figure_resolution=resolution)
@@ -172,8 +174,8 @@ def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
     return config
 
 
-def _check(config: ReproduceConfig) -> Launcher:
-    """Check all settings before any work starts; return the launcher."""
+def _check(config: ReproduceConfig) -> None:
+    """Check all settings before any work starts."""
     check_choice("launcher", config.launcher, LAUNCHERS)
     for name, least in {"processes": 1, "threads": 1, "max_frames": 1, "surface_frames": 0, "figure_resolution": 16}.items():
         check_number(name, getattr(config, name), least)
@@ -182,13 +184,8 @@ def _check(config: ReproduceConfig) -> Launcher:
             raise UserError(f"launcher_settings: wanted settings such as [partition=gpu], got '{one}'")
     if config.launcher != "submitit_slurm":  # a cluster may have devices that this machine lacks
         check_device(config.device)
-    threads = config.threads
-    if threads is None and config.launcher in ("joblib", "submitit_local"):
-        threads = max(1, count_cores() // config.processes)
-    launcher = Launcher(config.launcher, config.processes, threads, tuple(config.launcher_settings))
     if not (config.dry_run or config.only_report):
-        check_launcher(launcher)
-    return launcher
+        check_launcher(config.launcher, config.launcher_settings)
 
 
 def _report_folder(config: ReproduceConfig, plan: Plan) -> Path:
@@ -243,7 +240,7 @@ class _Progress:
         if status.state == "running":
             log.info("started: %s (%s)", job.name, Path(job.folder) / "reproduce.log")
             return
-        if status.state == "stopped":
+        if status.state == "stopped" or status.retry:
             return
         self._ended.add(number)
         self.done += status.state == "done"

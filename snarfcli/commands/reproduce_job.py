@@ -1,4 +1,4 @@
-"""`snarf reproduce_job`: one run of a plan. Called by Hydra's launchers, which `snarf reproduce` starts."""
+"""`snarf reproduce_job`: one run of a plan. `snarf reproduce` starts it, itself or through Hydra's launchers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omegaconf import MISSING
 
-from snarfcli.reproduce.launching import run_planned_job
+from snarfcli.reproduce.planned_jobs import run_planned_job
 
 __all__ = ["ReproduceJobConfig", "run"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +15,7 @@ from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json, remove_temporaries, write_json
 from snarfcli.locks import inherited_locks, locked
 from snarfcli.output_locks import clear_killed
+from snarfcli.reproduce.failures import AGAIN, ALONE, reason_of, retry_of
 from snarfcli.reproduce.plans import EvaluationStage, Job
 from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.samples.layout import samples_folder
@@ -68,13 +68,24 @@ class JobStatus:
     """Reason of a failure, one line."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Duration of each stage of the last call; stages with nothing to do are left out."""
+    tries: int = 1
+    """How often the last call has tried it."""
+    retry: str = ""
+    """Whether it may help to try a failed run once more: `failures.AGAIN` or `failures.ALONE`; empty if not."""
 
 
 Runner = Callable[[Sequence[str], Path, Callable[[], bool]], int]
 """Runs `snarf` with arguments, appends its output to a file, regularly asks whether to stop, and returns its exit code."""
 
 
-def run_job(job: Job, *, stopped: Callable[[], bool] = lambda: False, runner: Runner | None = None) -> JobStatus:
+def run_job(
+    job: Job,
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+    runner: Runner | None = None,
+    threads: Callable[[], int | None] = lambda: None,
+    tries: int = 1,
+) -> JobStatus:
     """Run the missing stages of a run, and return and record its status.
 
     Existing samples, an avatar trained with the same settings, and evaluations newer than the avatar are kept. A run that
@@ -84,6 +95,8 @@ def run_job(job: Job, *, stopped: Callable[[], bool] = lambda: False, runner: Ru
         job: the run.
         stopped: called regularly; when it returns True, the running command is interrupted and can write a checkpoint.
         runner: runs the commands.
+        threads: returns the number of threads for the next command that does not name it; None leaves it to the command.
+        tries: number of this try.
     """
     folder = Path(job.folder)
     runner = runner or run_command
@@ -96,7 +109,7 @@ def run_job(job: Job, *, stopped: Callable[[], bool] = lambda: False, runner: Ru
         check()
         with locked(folder / _LOCK, check):
             try:
-                status = _Stages(job, stopped, runner).run()
+                status = _Stages(job, stopped, runner, threads, tries).run()
             except (JobStopped, KeyboardInterrupt):
                 status = replace(read_status(folder) or JobStatus("stopped", job.digest), state="stopped")
             write_json(folder / STATUS, asdict(status))
@@ -120,7 +133,8 @@ def read_job_status(path: Path) -> JobStatus | None:
         status = read_described(JobStatus, read_json(path), "status", ignore_unknown=True)
     except (UserError, DescriptionError):
         return None
-    status = replace(status, stage=one_line(status.stage, 20), reason=one_line(status.reason, 500))
+    retry = status.retry if status.retry in (AGAIN, ALONE) else ""
+    status = replace(status, stage=one_line(status.stage, 20), reason=one_line(status.reason, 500), retry=retry)
     return status if status.state in STATES else None
 
 
@@ -140,13 +154,16 @@ def is_evaluated(evaluation: EvaluationStage, avatar: Path) -> bool:
 class _Stages:
     """The stages of one run, in order."""
 
-    def __init__(self, job: Job, stopped: Callable[[], bool], runner: Runner) -> None:
-        self.job, self.stopped, self.runner = job, stopped, runner
+    def __init__(
+        self, job: Job, stopped: Callable[[], bool], runner: Runner, threads: Callable[[], int | None], tries: int
+    ) -> None:
+        self.job, self.stopped, self.runner, self.threads = job, stopped, runner, threads
         self.folder = Path(job.folder)
         self.avatar = self.folder / "avatar.pt"
         self.before = read_status(self.folder) or JobStatus("stopped")
         same = self.before.digest == job.digest
-        self.status = JobStatus("running", job.digest, trained=same and self.before.trained and self.avatar.is_file())
+        trained = same and self.before.trained and self.avatar.is_file()
+        self.status = JobStatus("running", job.digest, trained, tries=tries)
 
     def run(self) -> JobStatus:
         """Run the stages and return the final status."""
@@ -180,15 +197,22 @@ class _Stages:
         self._write(stage=name)
         start, log = time.monotonic(), self.folder / LOG
         begin = log.stat().st_size if log.exists() else 0
-        code = self.runner(arguments, log, self.stopped)
+        code = self.runner(self._with_threads(arguments), log, self.stopped)
         spent = self.status.seconds.get(name, 0.0) + time.monotonic() - start
         self._write(seconds={**self.status.seconds, name: round(spent, 2)})
         if code == 0:
             return True
         self._check()
-        diverged = name == "train" and self._has_diverged()
-        self.status = replace(self.status, state="diverged" if diverged else "failed", reason=_reason(log, begin, code))
+        diverged, reason = name == "train" and self._has_diverged(), reason_of(log, begin, code)
+        retry = retry_of(code, reason) if self.status.tries == 1 and not diverged else ""
+        self.status = replace(self.status, state="diverged" if diverged else "failed", reason=reason, retry=retry)
         return False
+
+    def _with_threads(self, arguments: Sequence[str]) -> Sequence[str]:
+        """Return the arguments of a command with its share of the threads."""
+        threads = self.threads() if arguments[0] in ("train", "eval") else None
+        has_threads = any(argument.startswith("threads=") for argument in arguments)
+        return arguments if threads is None or has_threads else (*arguments, f"threads={threads}")
 
     def _has_diverged(self) -> bool:
         try:
@@ -269,16 +293,3 @@ def _frames(folder: Path, split: str) -> int | None:
     frames = content.get("frames") if isinstance(content, dict) else None
     count = frames.get(split) if isinstance(frames, dict) else None
     return count if type(count) is int else None
-
-
-def _reason(log: Path, begin: int, code: int) -> str:
-    """Return why a command failed: the last line of its output, without the name of the command."""
-    with log.open("rb") as file:
-        file.seek(begin)
-        lines = [line.strip() for line in file.read().decode(errors="replace").splitlines() if line.strip()]
-    last = lines[-1] if len(lines) > 1 else ""
-    if code < 0:
-        name = signal.Signals(-code).name if -code in [one.value for one in signal.Signals] else f"signal {-code}"
-        why = " (out of memory?)" if name == "SIGKILL" else ""
-        return f"ended by {name}{why}"
-    return last.removeprefix("snarf ").partition(": ")[2] if last.startswith("snarf ") else last or f"exit code {code}"

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -190,4 +191,32 @@ def test_a_command_that_is_killed_is_named(job):
         Path(log).write_text("busy\n")
         return -signal.SIGKILL
 
-    assert run_job(job, runner=killed).reason == "ended by SIGKILL (out of memory?)"
+    status = run_job(job, runner=killed)
+    assert (status.reason, status.tries, status.retry) == ("ended by SIGKILL (out of memory?)", 1, "alone")
+    status = run_job(job, runner=killed, tries=2)
+    assert (status.tries, status.retry) == (2, ""), "once more, not again and again"
+    assert read_status(Path(job.folder)) == status
+
+
+def test_a_wrong_setting_and_a_diverged_run_are_not_tried_again(job):
+    assert run_job(job, runner=Player(job, train=2)).retry == ""
+    write_json(Path(job.folder) / "metrics.json", {"status": "diverged", "steps": 5})
+    status = run_job(job, runner=lambda *_: -signal.SIGSEGV)
+    assert (status.state, status.retry) == ("diverged", "")
+
+
+def test_each_command_gets_its_share_of_the_threads(job):
+    shares = iter((1, 2, None))
+    seen = []
+
+    def runner(arguments, log, stopped):
+        seen.append([argument for argument in arguments if argument.startswith("threads=")])
+        return Player(job)(arguments, log, stopped)
+
+    status = run_job(job, runner=runner, threads=lambda: next(shares))
+    assert seen == [["threads=1"], ["threads=2"], []]
+    assert run_job(job, threads=lambda: 4) == replace(status, seconds={}), "with other threads it is still done"
+    given = replace(job, digest="another", train=(*job.train, "threads=3"))
+    seen.clear()
+    run_job(given, runner=runner, threads=lambda: 4)
+    assert seen[0] == ["threads=3"]

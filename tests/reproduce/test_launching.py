@@ -1,76 +1,145 @@
-"""Hydra's launchers run the jobs of a plan and return their status."""
+"""The jobs of a plan are run, watched, stopped, and tried once more where that can help."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import logging
 import os
 import signal
 import socket
 import subprocess
 import sys
-from dataclasses import asdict
-from pathlib import Path
 
 import pytest
+from fake_gpus import install_gpus
+from fake_jobs import FakeJobs
 from fake_runs import fake_plan, fake_run
 
 from snarfcli.errors import UserError
-from snarfcli.files import write_json
-from snarfcli.locks import hold_slot
+from snarfcli.hydra_config.launchers import is_installed
 from snarfcli.reproduce import launching
 from snarfcli.reproduce.jobs import JobStatus
-from snarfcli.reproduce.launching import Launcher, PlannedJobs, check_launcher, launch, run_planned_job
-from snarfcli.slots import current_slot, use_slot
+from snarfcli.reproduce.launchers import Launcher, LocalProcesses
+from snarfcli.reproduce.launching import check_launcher, default_processes, launch
 
 
-@pytest.mark.parametrize("name", ["basic", "joblib"])
-def test_a_launcher_brings_every_job_to_its_end(name, tmp_path, monkeypatch):
-    if name != "basic" and not launching.is_installed(name):
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    monkeypatch.setattr(launching, "_LOOK_EVERY_S", 0.02)
+
+
+@pytest.fixture
+def jobs(tmp_path):
+    return fake_plan(tmp_path, systems=("snarf", "nasa", "back_d")).jobs
+
+
+def fake_jobs(tmp_path, monkeypatch, actions):
+    """Let jobs be started that do what `actions` says, with their files in a folder of their own."""
+    folder = tmp_path / "fake"
+    folder.mkdir()
+    return FakeJobs(folder, monkeypatch, actions)
+
+
+@pytest.mark.parametrize("name", ["local", "joblib"])
+def test_a_launcher_brings_every_job_to_its_end(name, jobs, tmp_path, monkeypatch):
+    if name != "local" and not is_installed(name):
         pytest.skip(f"hydra-{name}-launcher is not installed")
     monkeypatch.chdir(tmp_path)
-    jobs = fake_plan(tmp_path, systems=("snarf", "nasa")).jobs
     for job in jobs:  # all results exist, so that only the launcher is tested
         fake_run(job, {"id": 0.9, "ood": 0.8})
-    seen = []
-    processes = 2 if name == "joblib" else 1
-    statuses = launch(jobs, tmp_path / "work", Launcher(name, processes), lambda *change: seen.append(change))
-    said = [path.read_text() for path in tmp_path.glob("work/*/launcher.log")]
-    assert [status and status.state for status in statuses] == ["done", "done"], (statuses, said)
-    assert {number for number, status in seen if status.state == "done"} == {0, 1}
-    assert len(seen) <= 4
+    seen, looks = [], []
+    statuses = launch(jobs, tmp_path / "work", Launcher(name, 2), lambda *change: seen.append(change), lambda: looks.append(0))
+    said = [path.read_text() for path in tmp_path.glob("work/*/*.log")]
+    assert [status and (status.state, status.tries) for status in statuses] == [("done", 1)] * 3, (statuses, said)
+    assert {number for number, status in seen if status.state == "done"} == {0, 1, 2}
+    assert len(seen) <= 6
+    assert looks
     assert {path.name for path in tmp_path.iterdir()} == {"data", "outputs"}, "nothing is left behind"
 
 
-def test_a_launcher_that_does_not_start_is_an_error(tmp_path, monkeypatch):
-    jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
-    monkeypatch.setattr(launching, "_arguments", lambda *_: ["reproduce_job", "plan=none.json", "job=0"])
-    with pytest.raises(UserError, match=r"launcher=basic started no job: .*no plan at .*none.json; see"):
+def test_a_launcher_that_does_not_start_is_an_error(jobs, tmp_path, monkeypatch):
+    monkeypatch.setattr(launching, "write_plan", lambda *_: None)
+    with pytest.raises(UserError, match=r"launcher=local started no job: no plan at .*plan\.json; see .*0\.log"):
         launch(jobs, tmp_path / "work", Launcher(), lambda *_: None)
 
 
+@pytest.mark.skipif(not is_installed("joblib"), reason="hydra-joblib-launcher is not installed")
+def test_a_launcher_of_hydra_that_does_not_start_is_an_error(jobs, tmp_path):
+    with pytest.raises(UserError, match=r"launcher=joblib started no job: .*Key 'njobs' not in .*; see .*launcher\.log"):
+        launch(jobs, tmp_path / "work", Launcher("joblib", settings=("njobs=2",)), lambda *_: None)
+
+
+def test_failures_that_may_pass_are_tried_once_more_and_those_without_memory_alone(jobs, tmp_path, monkeypatch, caplog):
+    caplog.set_level(logging.INFO, "snarfcli")
+    jobs = [*jobs, *fake_plan(tmp_path, systems=("pose_onet", "back_lbs")).jobs]
+    fake = fake_jobs(tmp_path, monkeypatch, {
+        0: ["fail alone", "done"], 1: ["fail again", "fail"], 2: ["fail"], 3: ["signal SIGSEGV", "done"],
+        4: ["break SIGKILL", "break"],
+    })  # fmt: skip
+    seen = []
+    statuses = launch(jobs, tmp_path / "work", Launcher(processes=2), lambda *change: seen.append(change))
+    assert [(status.state, status.tries) for status in statuses if status] == [
+        ("done", 2), ("failed", 2), ("failed", 1), ("done", 2), ("failed", 2),
+    ]  # fmt: skip
+    order = fake.started()
+    assert sorted(order[:5]) == [0, 1, 2, 3, 4]
+    assert sorted(order[5:7]) == [1, 3], "when all others have ended"
+    assert order[7:] == [0, 4], "one after the other"
+    assert [event[:2] for event in fake.events()[-3:]] == [[0, "start"], [0, "end"], [4, "start"]]
+    told = [record.getMessage() for record in caplog.records if "once more" in record.getMessage()]
+    assert f"{jobs[0].name}: train: no luck; it is tried once more when no other run works" in told
+    assert f"{jobs[3].name}: reproduce: ended by SIGSEGV; it is tried once more when the other runs have ended" in told
+    assert len(told) == 4
+    assert [status.state for number, status in seen if number == 0 and status.state != "running"] == ["failed", "done"]
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
-def test_ctrl_c_stops_jobs_and_waits_for_them(tmp_path, monkeypatch):
-    jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
-    # a launcher that reports a running job and waits for the sign to stop, as the job does
-    code = "import pathlib, sys, time\nwork = pathlib.Path(sys.argv[1])\n(work / '0.json').write_text(sys.argv[2])\n"
-    code += "while not (work / 'stop').exists(): time.sleep(0.05)\n(work / 'ended').touch()\n"
-    running = json.dumps(asdict(JobStatus("running", jobs[0].digest)))
-    original = subprocess.Popen
-
-    def popen(command, **more):
-        (work,) = (tmp_path / "work").glob("[!.]*")
-        return original([sys.executable, "-c", code, str(work), running], **more)
-
-    monkeypatch.setattr(subprocess, "Popen", popen)
+def test_ctrl_c_stops_jobs_and_waits_for_them(jobs, tmp_path, monkeypatch):
+    fake = fake_jobs(tmp_path, monkeypatch, {0: ["done"], 1: ["stop"], 2: ["done"]})
+    seen = []
 
     def interrupt(number: int, status: JobStatus) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)  # handled as Ctrl-C is
+        seen.append((number, status.state))
+        if (number, status.state) == (1, "running"):
+            os.kill(os.getpid(), signal.SIGTERM)  # handled as Ctrl-C is
 
     with pytest.raises(KeyboardInterrupt):
         launch(jobs, tmp_path / "work", Launcher(), interrupt)
-    assert list(tmp_path.glob("work/*/ended")), "it was waited for"
+    assert fake.events()[-1][:2] == [1, "end"], "it was waited for"
+    assert seen[-1] == (1, "stopped")
+    assert fake.started() == [0, 1], "nothing was started any more"
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
+def test_a_second_ctrl_c_kills_the_jobs(jobs, tmp_path, monkeypatch):
+    fake = fake_jobs(tmp_path, monkeypatch, {0: ["hang"]})
+    processes = []
+
+    def wait(self: LocalProcesses) -> None:
+        processes.extend(child.process for child in self._running.values())
+        raise KeyboardInterrupt  # while it waits for the checkpoints
+
+    def interrupt() -> None:
+        if fake.hanging():
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(LocalProcesses, "wait", wait)
+    with pytest.raises(KeyboardInterrupt):
+        launch(jobs[:1], tmp_path / "work", Launcher(), lambda *_: None, interrupt)
+    assert [process.returncode for process in processes] == [-signal.SIGKILL]
+
+
+def test_jobs_do_not_outlive_an_error_of_the_call(jobs, tmp_path, monkeypatch):
+    fake = fake_jobs(tmp_path, monkeypatch, {0: ["stop"]})
+
+    def fail(number: int, status: JobStatus) -> None:
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        launch(jobs[:1], tmp_path / "work", Launcher(), fail)
+    assert fake.events()[-1][:2] == [0, "end"], "it was waited for"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="whether a holder lives is only known on Unix")
@@ -94,27 +163,6 @@ def test_only_what_earlier_calls_have_left_is_deleted(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == left
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
-def test_jobs_do_not_outlive_an_error_of_the_call(tmp_path, monkeypatch):
-    jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
-    original = subprocess.Popen
-    code = "import pathlib, sys, time\nwork = pathlib.Path(sys.argv[1])\n"
-    code += "while not (work / 'stop').exists(): time.sleep(0.05)\n(work / 'ended').touch()\n"
-
-    def popen(command, **more):
-        (work,) = (tmp_path / "work").glob("[!.]*")
-        return original([sys.executable, "-c", code, str(work)], **more)
-
-    def fail(path):
-        raise MemoryError
-
-    monkeypatch.setattr(subprocess, "Popen", popen)
-    monkeypatch.setattr(launching, "_read", fail)
-    with pytest.raises(MemoryError):
-        launch(jobs, tmp_path / "work", Launcher(), lambda *_: None)
-    assert list(tmp_path.glob("work/*/ended")), "it was waited for"
-
-
 @pytest.mark.parametrize("any_plugin", [True, False])
 def test_launchers_that_are_not_installed_name_what_to_install(monkeypatch, any_plugin):
     def find_spec(name):
@@ -122,54 +170,38 @@ def test_launchers_that_are_not_installed_name_what_to_install(monkeypatch, any_
             raise ModuleNotFoundError(f"No module named {name.partition('.')[0]!r}")
 
     monkeypatch.setattr(importlib.util, "find_spec", find_spec)
-    check_launcher(Launcher())
-    with pytest.raises(UserError, match=r"needs hydra-joblib-launcher; install it with: pip install 'snarf\[joblib\]'"):
-        check_launcher(Launcher("joblib", 2))
+    check_launcher("local")
+    with pytest.raises(UserError, match=r"^launcher=joblib needs hydra-joblib-launcher; .*: pip install 'snarf\[joblib\]'"):
+        check_launcher("joblib")
     with pytest.raises(UserError, match=r"pip install 'snarf\[submitit\]'"):
-        check_launcher(Launcher("submitit_slurm"))
-    with pytest.raises(UserError, match="processes: wanted 1 with launcher=basic, got 2; give launcher=joblib"):
-        check_launcher(Launcher("basic", 2))
+        check_launcher("submitit_slurm")
+    with pytest.raises(UserError, match="launcher_settings: wanted none with launcher=local"):
+        check_launcher("local", ["partition=gpu"])
 
 
-def test_settings_reach_hydra(tmp_path):
-    arguments = launching._arguments(tmp_path, 3, Launcher("submitit_slurm", 8, 4, ("partition=gpu", "timeout_min=60")))
-    assert {"job=0,1,2", "-m", "hydra/launcher=submitit_slurm", "hydra.launcher.partition=gpu"} <= set(arguments)
-    assert {"hydra.launcher.array_parallelism=8", "hydra.launcher.cpus_per_task=4"} <= set(arguments)
-    assert "hydra.launcher.timeout_min=60" in arguments
-    assert len([a for a in arguments if "timeout_min" in a]) == 1
-    assert "hydra.launcher.n_jobs=2" in launching._arguments(tmp_path, 3, Launcher("joblib", 2))
-    assert launching._slots(Launcher("submitit_local", 3)) == 3
-    assert launching._slots(Launcher("joblib", 3)) is None
+def test_as_many_jobs_run_as_there_are_gpus_or_cores_with_memory(monkeypatch):
+    asked = []
+    monkeypatch.setattr(launching, "choose_processes", lambda jobs, bytes_each: asked.append((jobs, bytes_each)) or 6)
+    install_gpus(monkeypatch, [], None)
+    assert default_processes("local", 9, "auto") == default_processes("joblib", 9, "cpu") == 6
+    assert asked == [(9, 2**30)] * 2
+    install_gpus(monkeypatch, [(9, 0)] * 4, None)
+    for device, jobs, wanted in (("auto", 9, 4), ("cuda", 3, 3), ("cuda:1", 9, 1), ("cpu", 9, 6)):
+        assert default_processes("local", jobs, device) == wanted
+    assert default_processes("submitit_slurm", 9, "auto") == 9
+    monkeypatch.setenv("SNARF_GPU_SLOT", "1")
+    assert default_processes("local", 9, "cuda") == 1, "all jobs use the GPU that the user has given"
 
 
-def test_waiting_jobs_get_a_slot_when_they_start_and_see_the_gpus_of_the_call(tmp_path, monkeypatch):
-    """submitit starts all jobs at once, and sets CUDA_VISIBLE_DEVICES to nothing on this machine."""
-    jobs = fake_plan(tmp_path, systems=("snarf",)).jobs
-    seen = []
+def test_processes_of_launchers_that_start_all_jobs_are_limited_and_share_the_cores(jobs, tmp_path, monkeypatch):
+    monkeypatch.setattr(launching, "count_cores", lambda: 8)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
 
-    def run_job(job, *, stopped):
-        seen.append((current_slot(), os.environ.get("CUDA_VISIBLE_DEVICES")))
-        return JobStatus("done", job.digest)
+    def plan(launcher: Launcher) -> tuple[int | None, int | None]:
+        plan = launching._Call(jobs, tmp_path, launcher, lambda *_: None, None)._plan()
+        return plan.slots, plan.threads
 
-    monkeypatch.setattr(launching, "run_job", run_job)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    for visible in ("2,5", None):
-        plan = PlannedJobs(3, tuple(jobs), visible)
-        write_json(tmp_path / "plan.json", asdict(plan))
-        with hold_slot(tmp_path):
-            run_planned_job(tmp_path / "plan.json", 0)
-    assert seen == [(1, "2,5"), (1, None)]
-    assert os.environ["CUDA_VISIBLE_DEVICES"] == ""
-
-    write_json(tmp_path / "plan.json", asdict(PlannedJobs(None, tuple(jobs), "2,5")))
-    with use_slot(4):  # of a launcher that starts a job when it can run, or of a cluster, which assigns GPUs itself
-        run_planned_job(tmp_path / "plan.json", 0)
-    assert seen[2:] == [(4, "")]
-
-
-def test_a_job_that_is_not_in_the_plan_is_rejected(tmp_path):
-    with pytest.raises(UserError, match="no plan at"):
-        run_planned_job(tmp_path / "plan.json", 0)
-    (tmp_path / "plan.json").write_text('{"jobs": [], "slots": null}')
-    with pytest.raises(UserError, match="has no job 3"):
-        run_planned_job(Path(tmp_path / "plan.json"), 3)
+    assert plan(Launcher("submitit_local", 3)) == (3, 2)
+    assert plan(Launcher("joblib", 3)) == (None, 2)
+    assert plan(Launcher("joblib", 3, threads=5)) == (None, None), "the commands name them"
+    assert plan(Launcher("submitit_slurm", 3)) == (None, None)

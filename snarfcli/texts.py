@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["markdown_text", "one_line", "terminal_text"]
+__all__ = ["counted", "markdown_text", "one_line", "terminal_text"]
 
 _LAYOUT = "\n\t"  # the only control characters that text on a terminal needs
 _MARKS = re.compile(r"[^\w ,]|_")  # everything but letters of any script, digits, spaces and commas
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number of things: "1 frame", "2 frames". The plural of the noun must end in s."""
+    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
 def one_line(reason: str | BaseException, longest: int | None = None) -> str:

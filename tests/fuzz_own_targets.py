@@ -295,7 +295,8 @@ def _planned() -> Any:
 
     stage = EvaluationStage("id", "builtin", "data", ("eval", "subject=1"), "outputs/eval/metrics.json", {"max_frames": None})
     samples = (SamplesStage("data/processed/builtin/1", ("preprocess", "subject=1")),)
-    return Job("snarf", "SNARF", "builtin", "1", 0, "outputs/builtin/1/x", samples, ("train",), (stage,), "0" * 64)
+    folder, digest = "outputs/builtin/1/x", "0" * 64
+    return Job("snarf", "SNARF", "builtin", "1", 0, folder, samples, ("train",), (stage,), digest, digest[:16], 9, 1.0)
 
 
 def planned_job() -> Target:

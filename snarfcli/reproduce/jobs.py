@@ -28,7 +28,9 @@ __all__ = [
     "STATUS",
     "JobStatus",
     "JobStopped",
+    "Runner",
     "is_evaluated",
+    "processor_s_of_children",
     "read_job_status",
     "read_status",
     "run_command",
@@ -204,11 +206,11 @@ class _Stages:
         self._write(stage=name)
         log = self.folder / LOG
         begin = log.stat().st_size if log.exists() else 0
-        start, processor_start = time.monotonic(), _processor_s_of_children()
+        start, processor_start = time.monotonic(), processor_s_of_children()
         try:
             code = self.runner(self._with_threads(arguments), log, self.stopped)
         finally:
-            self._count(name, time.monotonic() - start, _processor_s_of_children() - processor_start)
+            self._count(name, time.monotonic() - start, processor_s_of_children() - processor_start)
         if code == 0:
             return True
         self._check()
@@ -302,7 +304,7 @@ def _plus(times: dict[str, float], name: str, seconds: float) -> dict[str, float
     return times | {name: round(times.get(name, 0.0) + seconds, 2)}
 
 
-def _processor_s_of_children() -> float:
+def processor_s_of_children() -> float:
     """Return the processor time of all commands that this process has waited for, of all their threads; 0 on Windows."""
     times = os.times()
     return times.children_user + times.children_system

@@ -94,7 +94,7 @@ def test_times_of_all_calls_are_added(job, monkeypatch):
     """By clocks that every command moves: by 10 s, in which two threads compute for 15 s."""
     clock = {"wall": 0.0, "processor": 0.0}
     monkeypatch.setattr(jobs.time, "monotonic", lambda: clock["wall"])
-    monkeypatch.setattr(jobs, "_processor_s_of_children", lambda: clock["processor"])
+    monkeypatch.setattr(jobs, "processor_s_of_children", lambda: clock["processor"])
 
     class Slow(Player):
         def __call__(self, arguments, log, stopped):
@@ -115,9 +115,9 @@ def test_times_of_all_calls_are_added(job, monkeypatch):
 
 @pytest.mark.skipif(os.name != "posix", reason="the system tells the processor time of children on Unix alone")
 def test_the_processor_time_of_a_command_is_known(tmp_path):
-    before = jobs._processor_s_of_children()
+    before = jobs.processor_s_of_children()
     run_command(["--version"], tmp_path / LOG, lambda: False)
-    assert jobs._processor_s_of_children() > before
+    assert jobs.processor_s_of_children() > before
 
 
 def test_a_stopped_plan_begins_nothing(job):

@@ -14,9 +14,9 @@ _LAYOUT = "\n\t"  # the only control characters that text on a terminal needs
 _MARKS = re.compile(r"[^\w ,]|_")  # everything but letters of any script, digits, spaces and commas
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number of things: "1 frame", "2 frames". The plural of the noun must end in s."""
-    return f"{count} {noun}" + ("" if count == 1 else "s")
+def counted(count: int, noun: str, plural: str | None = None) -> str:
+    """Return a number of things: "1 frame", "2 frames"; the plural is the noun with an s unless it is given."""
+    return f"{count} {noun if count == 1 else plural or noun + 's'}"
 
 
 def one_line(reason: str | BaseException, longest: int | None = None) -> str:

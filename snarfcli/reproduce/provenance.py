@@ -89,8 +89,11 @@ def _grouped(results: Sequence[Result], key: Callable[[Metrics], str]) -> Origin
 
 def _machine(origin: Metrics) -> str:
     machine, versions = origin.machine, origin.versions
-    cores, threads = machine.get("cores"), machine.get("threads")
-    parts = [machine.get("processor"), cores and f"{cores} cores", threads and f"{threads} threads per run"]
+    cores, threads = (
+        counted(machine[name], noun) if type(machine.get(name)) is int else ""
+        for name, noun in (("cores", "core"), ("threads", "thread"))
+    )
+    parts = [machine.get("processor"), cores, threads and f"{threads} per run"]
     parts += [machine.get("gpu"), machine.get("system"), "torch" in versions and f"PyTorch {versions['torch']}"]
     return ", ".join(_text(str(part)) for part in parts if part) or "unknown machine"
 

@@ -34,7 +34,7 @@ def test_one_version_and_one_machine_are_named_in_the_head(plan, tmp_path):
         fake_run(job, VALUES, code=OLD, spent_s={"samples": 5.0, "train": 600.0, "id": 15.0})
     text = text_of(plan, tmp_path / "report")
     assert "- code: commit 0123456789, files aaaaaaaaaaaa\n" in text
-    assert "- machine: a processor, 2 cores, 1 threads per run, Linux, PyTorch 2\n" in text
+    assert "- machine: a processor, 2 cores, 1 thread per run, Linux, PyTorch 2\n" in text
     assert "- cost: 4 runs: 41 min one after the other, 83 min of processor time, samples, validations" in text
     assert "## Versions" not in text
     assert "Unfinished" not in text
@@ -75,7 +75,7 @@ def test_several_machines_are_listed(plan, tmp_path):
     assert [len(runs) for runs in machines(collected(plan)).values()] == [2, 2]
     text = text_of(plan, tmp_path / "report")
     assert "- machine: **2 machines**, listed at the end of the page\n" in text
-    assert "## Machines\n\n- a processor, 2 cores, 1 threads per run" in text
+    assert "## Machines\n\n- a processor, 2 cores, 1 thread per run" in text
 
 
 def test_nothing_in_a_file_becomes_mark_up(plan, tmp_path):

@@ -187,7 +187,7 @@ def finished_duration(job: Job) -> Duration | None:
     evaluations = {one.split: spent.get(one.split) or _wall_s(Path(one.metrics)) for one in evaluated}
     threads, gpu = machine.get("threads"), machine.get("gpu")
     return Duration(
-        train_s, sum(evaluations.values()),
+        train_s, round(sum(evaluations.values()), 2),
         max(processor.get("train", 0.0), look_up(trained, ("timings", "processor_s")) or 0.0) or train_s,
         sum(processor.get(split) or seconds for split, seconds in evaluations.items()),
         threads if type(threads) is int else 1, machine_name(machine), gpu if isinstance(gpu, str) else "",

@@ -50,8 +50,8 @@ def cost_text(results: Sequence[Result]) -> str:
     which = counted(len(spent), "run") if len(spent) == len(results) else f"{len(spent)} of {counted(len(results), 'run')}"
     text = f"{which}: {time_text(sum(spent))} one after the other"
     if processor:
-        text += f", {time_text(sum(processor))} of processor time"
-    return f"{text}, samples, validations, evaluations and the start of the commands included"
+        text += f" and {time_text(sum(processor))} of processor time"
+    return f"{text}, with samples, validations, evaluations and the start of every command"
 
 
 def provenance_lines(results: Sequence[Result]) -> list[str]:

@@ -35,7 +35,7 @@ def test_one_version_and_one_machine_are_named_in_the_head(plan, tmp_path):
     text = text_of(plan, tmp_path / "report")
     assert "- code: commit 0123456789, files aaaaaaaaaaaa\n" in text
     assert "- machine: a processor, 2 cores, 1 thread per run, Linux, PyTorch 2\n" in text
-    assert "- cost: 4 runs: 41 min one after the other, 83 min of processor time, samples, validations" in text
+    assert "- cost: 4 runs: 41 min one after the other and 83 min of processor time, with samples, validations" in text
     assert "## Versions" not in text
     assert "Unfinished" not in text
 
@@ -92,7 +92,7 @@ def test_costs_of_runs_without_a_record_are_not_made_up(plan):
     assert cost_text(collected(plan)) == ""
     fake_run(plan.jobs[0], VALUES, spent_s={"train": 60.0})
     fake_run(plan.jobs[1], VALUES)
-    assert cost_text(collected(plan)).startswith("1 of 4 runs: 60 s one after the other, 2 min of processor time")
+    assert cost_text(collected(plan)).startswith("1 of 4 runs: 60 s one after the other and 2 min of processor time")
 
 
 def test_a_report_grows_with_its_runs(plan, tmp_path, caplog):

@@ -52,7 +52,7 @@ def measure_missing(plans: Sequence[Plan], jobs: Sequence[Job], durations: Durat
         counted(len(unknown), "kind") + " of run",
     )
     with tempfile.TemporaryDirectory(prefix="snarf-") as folder:
-        measurements = Measurements(Path(folder))
+        measurements = Measurements(Path(folder), durations.threads)
         try:
             for number, job in enumerate(unknown.values(), 1):
                 log.info("measuring %d of %d: %s", number, len(unknown), job.row)

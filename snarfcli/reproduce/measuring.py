@@ -47,11 +47,12 @@ class Measurements:
 
     Args:
         folder: an empty folder.
+        threads: number of threads of commands that do not name it.
         runner: runs the commands.
     """
 
-    def __init__(self, folder: Path, runner: Runner = run_command) -> None:
-        self.folder, self.runner = folder, runner
+    def __init__(self, folder: Path, threads: int, runner: Runner = run_command) -> None:
+        self.folder, self.threads, self.runner = folder, threads, runner
 
     def measure(self, job: Job, data: Mapping[str, Any]) -> Duration:
         """Return how long a run will take.
@@ -67,6 +68,7 @@ class Measurements:
         root, share = self._samples(job, data)
         steps = _steps_to_measure(job)
         where = {"data_root": quote(root), "output_root": quote(str(self.folder / "outputs")), "run": job.row}
+        where["threads"] = _value(job.train, "threads") or str(self.threads)
         periods = dict.fromkeys(("training.validate_every", "training.checkpoint_every"), max(1, steps // 2))
         train = self._run(_with(job.train, {**where, "training.steps": steps, **periods}))
         content = read_metrics(self._output(job) / "metrics.json")

@@ -78,7 +78,7 @@ def test_a_whole_run_follows_from_a_few_steps_and_frames(tmp_path, monkeypatch):
     job = fake_plan(tmp_path, systems=("nasa",)).jobs[0]
     fake_samples(tmp_path / "data", "50002", test=60, ood=56)
     commands = Commands(monkeypatch)
-    found = Measurements(tmp_path / "work", commands).measure(job, {})
+    found = Measurements(tmp_path / "work", 3, commands).measure(job, {})
     train_s, evaluations_s = whole(job, 60 + 56)
     assert found.train_s == pytest.approx(train_s, abs=0.1), "without the first steps"
     assert found.evaluations_s == pytest.approx(evaluations_s, abs=0.1)
@@ -91,6 +91,7 @@ def test_a_whole_run_follows_from_a_few_steps_and_frames(tmp_path, monkeypatch):
     assert train["model"] == "nasa"
     assert train["data_root"] == str(tmp_path / "data")
     assert train["output_root"] == str(tmp_path / "work/outputs"), "not among the results"
+    assert {given["threads"] for _, given in commands.calls} == {"3"}
     assert not (tmp_path / "outputs").exists()
 
 
@@ -98,7 +99,7 @@ def test_missing_samples_are_made_sparse_in_the_folder(tmp_path, monkeypatch):
     plan = fake_plan(tmp_path, systems=("nasa", "snarf"))
     (tmp_path / "data/processed/builtin/50002/manifest.json").unlink()
     commands = Commands(monkeypatch)
-    measurements = Measurements(tmp_path / "work", commands)
+    measurements = Measurements(tmp_path / "work", 3, commands)
     found = [measurements.measure(job, {"frame_step": 4, "ood_frame_step": 60}) for job in plan.jobs]
     assert [name for name, _ in commands.calls] == ["preprocess", "train", "eval", "train", "eval"], "once for all rows"
     _, made = commands.calls[0]
@@ -112,7 +113,7 @@ def test_a_command_that_fails_gives_its_reason(tmp_path, monkeypatch):
     job = fake_plan(tmp_path, systems=("nasa",)).jobs[0]
     (tmp_path / "work").mkdir()
     with pytest.raises(UserError, match="snarf train: no such luck"):
-        Measurements(tmp_path / "work", Commands(monkeypatch, {"nasa": 2})).measure(job, {})
+        Measurements(tmp_path / "work", 3, Commands(monkeypatch, {"nasa": 2})).measure(job, {})
 
 
 def test_only_unknown_rows_are_measured_and_an_interruption_keeps_the_others(tmp_path, monkeypatch, caplog):
@@ -120,7 +121,7 @@ def test_only_unknown_rows_are_measured_and_an_interruption_keeps_the_others(tmp
     plan = fake_plan(tmp_path, subjects=("50002", "50004"), systems=("pose_onet", "nasa", "snarf", "ours-local"))
     known = Durations(tmp_path / "durations.json", plan.jobs, machine_name(FAKE_MACHINE), 1)
     commands = Commands(monkeypatch, {"snarf": 2, "ours-local": JobStopped})
-    monkeypatch.setattr(dry_run, "Measurements", lambda folder: Measurements(folder, commands))
+    monkeypatch.setattr(dry_run, "Measurements", lambda folder, threads: Measurements(folder, threads, commands))
     dry_run.measure_missing([plan], plan.jobs, known)
     assert [given["run"] for name, given in commands.calls if name == "train"] == ["pose_onet", "nasa", "snarf", "ours-local"]
     assert "warning: row snarf cannot be measured: snarf train: no such luck" in caplog.text

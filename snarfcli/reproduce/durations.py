@@ -24,6 +24,7 @@ from snarfcli.reproduce.results import look_up
 __all__ = ["Duration", "Durations", "Estimate", "longest_first", "machine_name", "plan_seconds", "time_text"]
 
 _EVALUATIONS_HINT_S = 30.0  # both evaluations of a built-in subject on one core, with the start of the commands
+_LONGEST_S = 1e10  # longer ones are from damaged files
 _MOST_RUNS = 5  # kept of each kind; the estimate is their median
 
 
@@ -218,6 +219,7 @@ def plan_seconds(seconds: Sequence[float], processes: int) -> float:
 
 def time_text(seconds: float) -> str:
     """Return a duration with the precision that an estimate has: 40 s, 12 min, 3 h 05 min."""
+    seconds = min(seconds, _LONGEST_S)
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

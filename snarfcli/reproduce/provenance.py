@@ -57,7 +57,10 @@ def cost_text(results: Sequence[Result]) -> str:
 def provenance_lines(results: Sequence[Result]) -> list[str]:
     """Return the lines of a report's head: code, machine and cost."""
     lines = []
-    for what, plural, found in (("code", "versions", code_versions(results)), ("machine", "machines", machines(results))):
+    for what, plural, found in (
+        ("code", "versions", code_versions(results)),
+        ("machine", "combinations of machine and threads", machines(results)),
+    ):
         if len(found) > 1:
             lines.append(f"{what}: **{len(found)} {plural}**, listed at the end of the page")
         else:
@@ -70,7 +73,7 @@ def provenance_sections(results: Sequence[Result]) -> list[str]:
     """Return the sections that list the runs of each version of the code and of each machine; none where there is one only."""
     return [
         f"## {title}\n\n" + "\n".join(f"- {origin}: {'; '.join(runs)}" for origin, runs in found.items())
-        for title, found in (("Versions of the code", code_versions(results)), ("Machines", machines(results)))
+        for title, found in (("Versions of the code", code_versions(results)), ("Machines and threads", machines(results)))
         if len(found) > 1
     ]
 
@@ -83,7 +86,7 @@ def _grouped(results: Sequence[Result], key: Callable[[Metrics], str]) -> Origin
             stages.setdefault(key(origin), []).append(stage)
         for text, some in stages.items():
             part = "" if len(stages) == 1 else f" ({', '.join(some)})"
-            found.setdefault(text, []).append(markdown_name(result.job.name) + part)
+            found.setdefault(text, []).append(_plain(result.job.name) + part)
     return found
 
 
@@ -98,7 +101,7 @@ def _machine(origin: Metrics) -> str:
     return ", ".join(_text(str(part)) for part in parts if part) or "unknown machine"
 
 
-def markdown_name(text: str) -> str:
+def _plain(text: str) -> str:
     """Return a text for Markdown: as it is if nothing in it is mark-up."""
     line = one_line(text)
     return line if _PLAIN.fullmatch(line) else markdown_text(line)
@@ -106,4 +109,4 @@ def markdown_name(text: str) -> str:
 
 def _text(value: object) -> str:
     """Return a text of a file for Markdown; empty if it is none."""
-    return markdown_name(one_line(value, _LONGEST)) if isinstance(value, str) else ""
+    return _plain(one_line(value, _LONGEST)) if isinstance(value, str) else ""

@@ -74,8 +74,8 @@ def test_several_machines_are_listed(plan, tmp_path):
         fake_run(job, VALUES, machine=FAKE_MACHINE | {"threads": 1 + number % 2})
     assert [len(runs) for runs in machines(collected(plan)).values()] == [2, 2]
     text = text_of(plan, tmp_path / "report")
-    assert "- machine: **2 machines**, listed at the end of the page\n" in text
-    assert "## Machines\n\n- a processor, 2 cores, 1 thread per run" in text
+    assert "- machine: **2 combinations of machine and threads**, listed at the end of the page\n" in text
+    assert "## Machines and threads\n\n- a processor, 2 cores, 1 thread per run" in text
 
 
 def test_nothing_in_a_file_becomes_mark_up(plan, tmp_path):

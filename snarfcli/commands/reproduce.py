@@ -158,6 +158,7 @@ def _run_jobs(
         launch(jobs, folder, launcher, progress.on_change, progress.look)
     except KeyboardInterrupt:
         progress.close()
+        growing.stop()
         log.info("stopped with %d of %s done; run the same command to continue", progress.done, counted(len(jobs), "run"))
         raise
     finally:

@@ -38,6 +38,7 @@ class GrowingReports:
     def __init__(self, reports: Sequence[PlannedReport]) -> None:
         self.reports = reports
         self._results = [{job.folder: collect(job) for job in report.plan.jobs} for report in reports]
+        self._begun: set[Path] = set()  # folders of the reports that were written
         self._has_failed = False
 
     def update(self, ended: str, running: Collection[str]) -> None:
@@ -54,7 +55,14 @@ class GrowingReports:
             results[ended] = collect(jobs[ended])
             self._write(report, [_shown(results[folder], folder in running) for folder in jobs])
 
+    def stop(self) -> None:
+        """Write the reports that were written before once more, after an interruption: nothing runs now."""
+        for report in self.reports:
+            if report.folder in self._begun:
+                self._write(report, [collect(job) for job in report.plan.jobs])
+
     def _write(self, report: PlannedReport, results: Sequence[Result]) -> None:
+        self._begun.add(report.folder)
         try:
             with hold_output(report.folder, "snarf reproduce"):
                 write_report(report.plan, results, report.folder, report.command, about=report.about, is_growing=True)

@@ -92,7 +92,7 @@ class PlanProgress:
         jobs: jobs in the order in which they start.
         processes: number of jobs at a time.
         durations: estimates; each run that ends is added to them.
-        on_end: called after a run has ended, with its number.
+        on_end: called after a run has ended, with its number; not for one that was done before.
     """
 
     def __init__(self, jobs: Sequence[Job], processes: int, durations: Durations, on_end: Callable[[int], None]) -> None:
@@ -132,7 +132,8 @@ class PlanProgress:
         self._estimate_again()
         outcome = self._outcome(job, status)
         log.info("%d of %d: %s: %s%s", len(self._ended), len(self.jobs), job.name, outcome, self._left())
-        self.on_end(number)
+        if status.seconds or status.state != "done":
+            self.on_end(number)
 
     def look(self) -> None:
         """Show what runs, if it is time."""

@@ -119,6 +119,9 @@ def test_progress_is_shown_in_lines_and_runs_that_end_give_better_estimates(plan
     assert (tmp_path / "durations.json").is_file()
     assert "1 of 4: NASA, subject 50002, seed 0: bbox 95.0/90.0, surface 90.0/80.0" in caplog.text
     assert shown._taken_s / shown._estimated_s == 4, "four times as long as it would take undisturbed"
+    fake_run(plan.jobs[2], {"id": 0.9, "ood": 0.8})
+    shown.on_change(2, JobStatus("done"))
+    assert ended == [0], "it was done before"
     shown.on_change(1, JobStatus("stopped"))
-    assert shown.lines() == [f"1 of 4 runs done, 0 running{shown._left()}"]
+    assert shown.lines() == [f"2 of 4 runs done, 0 running{shown._left()}"]
     shown.close()

@@ -6,7 +6,6 @@ import pytest
 from fake_runs import FAKE_MACHINE, fake_metrics, fake_plan, fake_run
 
 from snarfcli.files import write_json
-from snarfcli.reproduce.growing import GrowingReports, PlannedReport
 from snarfcli.reproduce.provenance import code_versions, cost_text, machines
 from snarfcli.reproduce.report import write_report
 from snarfcli.reproduce.results import collect
@@ -93,31 +92,3 @@ def test_costs_of_runs_without_a_record_are_not_made_up(plan):
     fake_run(plan.jobs[0], VALUES, spent_s={"train": 60.0})
     fake_run(plan.jobs[1], VALUES)
     assert cost_text(collected(plan)).startswith("1 of 4 runs: 60 s one after the other and 2 min of processor time")
-
-
-def test_a_report_grows_with_its_runs(plan, tmp_path, caplog):
-    report = PlannedReport(plan, tmp_path / "report", "snarf reproduce table1")
-    growing = GrowingReports([report])
-    first, second = plan.jobs[:2]
-    fake_run(first, VALUES)
-    growing.update(first.folder, {second.folder})
-    page, table = tmp_path / "report/table1.md", tmp_path / "report/table1.csv"
-    text = page.read_text()
-    assert "**Unfinished: 1 of 4 runs done**; this page is written again after every run." in text
-    assert "| [90.0](" in text
-    assert "- SNARF, subject 50002, seed 0: running: not finished yet\n- 2 runs more: not run yet" in text
-    assert "table1.csv" in {path.name for path in page.parent.iterdir()}
-    assert ",running," in table.read_text()
-    copy = tmp_path / "report/runs/50002/nasa-quick-s0/eval_id.json"
-    before = copy.stat().st_mtime_ns
-    fake_run(second, VALUES)
-    growing.update(second.folder, set())
-    assert "Unfinished: 2 of 4 runs done" in page.read_text()
-    assert copy.stat().st_mtime_ns == before, "files that are there are not copied again"
-    growing.update("another folder", set())
-
-    page.unlink()
-    page.mkdir()
-    for _ in range(2):
-        growing.update(second.folder, set())
-    assert caplog.text.count("warning: the table of the runs so far was not written") == 1

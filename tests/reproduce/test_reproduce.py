@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from fake_runs import fake_run
 from omegaconf import OmegaConf
 from toy_training import toy_store
 
@@ -170,3 +171,30 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
     assert run(again) == 1
     assert calls == []
     assert "| NASA | missing | missing |" in (folder / "table1.md").read_text()
+
+
+def test_ctrl_c_leaves_a_table_of_the_runs_so_far(tmp_path, monkeypatch, caplog):
+    toy_store(tmp_path / "data", points=400, frames=8)
+    caplog.set_level(logging.INFO, "snarfcli")
+    defaults = OmegaConf.to_container(OmegaConf.load(config_folder() / "reproduce" / "reproduce.yaml"))
+    defaults.pop("defaults")
+    config = ReproduceConfig(**defaults | {
+        "what": "table1", "subjects": ["toy"], "systems": ["back_d", "nasa"], "data_root": str(tmp_path / "data"),
+        "output_root": str(tmp_path / "outputs"),
+    })  # fmt: skip
+
+    def launch(jobs, folder, launcher, on_change, on_look):
+        for number, job in enumerate(jobs):
+            on_change(number, JobStatus("running"))
+            fake_run(job, {"id": 0.9, "ood": 0.8}, "stopped" if number else "done", trained=not number)
+        on_change(0, JobStatus("done", seconds={"train": 1.0}))
+        on_change(1, JobStatus("stopped"))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reproduce, "launch", launch)
+    with pytest.raises(KeyboardInterrupt):
+        run(config)
+    assert "stopped with 1 of 2 runs done; run the same command to continue" in caplog.text
+    text = (tmp_path / "outputs/reproduce/table1/table1.md").read_text()
+    assert "**Unfinished: 1 of 2 runs done**" in text
+    assert "- Back-D, subject toy, seed 0: stopped: interrupted at train" in text, "not as if it still ran"

@@ -76,11 +76,12 @@ class Measurements:
         chosen = {"max_frames": _FRAMES, "surface_frames": min(1, evaluation.settings["surface_frames"])}
         spent = self._run(_with(evaluation.arguments, {**where, **chosen}))
         (evaluated,) = self._output(job).glob("eval_*/metrics.json")
-        wall_s = look_up(read_metrics(evaluated).content, ("timings", "wall_s")) or spent.wall_s
+        measured = read_metrics(evaluated).content
+        wall_s, count = look_up(measured, ("timings", "wall_s")) or 0.0, look_up(measured, ("frames",)) or _FRAMES
         train_s, train_processor_s = _whole_training(job, content.content, train)
         start_s = max(0.0, spent.wall_s - wall_s)
         frames = [_frames(one, job, root, share) for one in job.evaluations]
-        evaluations_s = len(frames) * start_s + sum(frames) * wall_s / (_FRAMES + 1)  # the first one is done twice
+        evaluations_s = len(frames) * start_s + sum(frames) * wall_s / (count + 1)  # the first one is done twice
         gpu, threads = content.machine.get("gpu"), content.machine.get("threads")
         return Duration(
             round(train_s, 1), round(evaluations_s, 1), round(train_processor_s, 1),

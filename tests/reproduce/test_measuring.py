@@ -61,7 +61,7 @@ class Commands:
     def eval(self, given):
         wall_s = FRAME_S * (1 + int(given["max_frames"]))
         self.now += wall_s
-        content = fake_metrics(0.9, {}) | {"timings": {"wall_s": wall_s}}
+        content = fake_metrics(0.9, {}) | {"frames": int(given["max_frames"]), "timings": {"wall_s": wall_s}}
         write_json(self.folder(given) / "eval_id_part/metrics.json", content)
 
     def folder(self, given):

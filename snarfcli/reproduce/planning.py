@@ -26,6 +26,7 @@ __all__ = ["choose_experiments", "make_plan"]
 # The out-of-distribution poses of DFaust's subjects are another data set: PosePrior's motion on their bodies.
 _OTHER_OOD_DATA = {"dfaust": "poseprior"}
 _PARITY_FOLDER = "parity"
+_STEPS_OF_A_COST = 1200  # of training=quick, for which `Row.cost` is
 # For the curves of a training: its number of validations, and of frames out of distribution in each.
 _VALIDATIONS = 6
 _VALIDATION_OOD_FRAMES = 8
@@ -117,7 +118,7 @@ def make_plan(experiment: Experiment, options: ExperimentOptions, resolve: Resol
     )
     preset = resolve((*common, *options.extra))  # without the settings of a row
     chosen = replace(experiment, rows=tuple(rows))
-    return Plan(chosen, data, tuple(subjects), options.seeds, training, options.extra, jobs, preset["training"])
+    return Plan(chosen, data, tuple(subjects), options.seeds, training, options.extra, jobs, preset["training"], preset["data"])
 
 
 def _chosen_rows(experiment: Experiment, options: ExperimentOptions) -> list[Row]:
@@ -156,6 +157,9 @@ def _job(
         train=train,
         evaluations=_evaluation_stages(data, subject, folder, options, where, machine),
         digest=_digest([resolved, seed, data, subject, row.inside_test]),
+        kind=_digest([resolved, data, row.inside_test, options.max_frames, options.surface_frames])[:16],
+        steps=resolved["training"]["steps"],
+        hint_s=60 * row.cost * resolved["training"]["steps"] / _STEPS_OF_A_COST,
     )
 
 

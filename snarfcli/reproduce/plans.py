@@ -81,6 +81,12 @@ class Job:
     """Evaluations after the training."""
     digest: str
     """Hash of all settings that the avatar depends on."""
+    kind: str
+    """Hash of the settings without subject and seed: runs of one kind take about as long."""
+    steps: int
+    """Number of training steps."""
+    hint_s: float
+    """Rough processor time of its training in seconds, for estimates before anything is measured."""
 
     @property
     def name(self) -> str:
@@ -108,6 +114,8 @@ class Plan:
     """Runs."""
     training_settings: dict[str, Any]
     """Settings of the preset after `extra`."""
+    data_settings: dict[str, Any]
+    """Settings of the data set."""
 
 
 def unique_jobs(plans: Sequence[Plan]) -> list[Job]:

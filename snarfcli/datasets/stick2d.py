@@ -169,7 +169,8 @@ def _prisms(shapes: list[_Flat], num_joints: int) -> MeshTemplate:
         all_weights[:, joints] = np.concatenate([own_weights, own_weights, own_weights[outline]])
         weights.append(all_weights)
         count += len(all_weights)
-    return MeshTemplate(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.concatenate(weights))
+    joined = np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.concatenate(weights)
+    return MeshTemplate(*joined, is_planar=True)
 
 
 def _angles_in_range(count: int, generator: np.random.Generator) -> NDArray[np.float64]:

@@ -47,7 +47,7 @@ def require_refinable(avatar: TrainedField, store: SampleStore, setting: str) ->
     if not isinstance(avatar.model, FastSnarf):
         name = avatar.config.model.name
         raise ValueError(f"{setting}: wanted model fast_snarf or snarf, got {name}, which has no forward skinning")
-    if store.manifest["settings"].get("is_planar", False):
+    if store.is_planar:
         raise ValueError(f"{setting}: wanted samples of surfaces in space, got planar ones; leave it out")
 
 

@@ -83,8 +83,9 @@ class Nasa(PointwiseSystem):
 
     def _build(self, skeleton: Skeleton, grid: CanonicalGrid, template: MeshTemplate | None) -> None:
         self.register_buffer("_segments", _own_segments(skeleton), persistent=False)
+        chosen = None if template is None else template.surface_vertices()
         for name, values in (("_vertices", template and template.vertices), ("_vertex_weights", template and template.weights)):
-            given = None if values is None else torch.tensor(values, dtype=torch.float32)
+            given = None if values is None else torch.tensor(values[chosen], dtype=torch.float32)
             self.register_buffer(name, given, persistent=False)
 
     def _make_shape(self, bones: Tensor, box: tuple[Tensor, Tensor]) -> PartNetworks:

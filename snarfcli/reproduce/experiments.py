@@ -189,7 +189,8 @@ _STICK2D = Experiment(
         Row("ours-none", "forward skinning (ours)", (*_OURS, "condition=none"), cost=0.8),
         Row("back_lbs", "Back-LBS", ("model=back_lbs", "condition=none"), cost=0.5),
         Row("pose_onet", "Pose-ONet", ("model=pose_onet", "condition=none"), cost=0.2),
-        Row("piecewise", "Piecewise", ("model=piecewise", "condition=none"), cost=0.5),
+        Row("piecewise", "Piecewise (rigid)", ("model=piecewise", "condition=none"), cost=0.5),
+        Row("piecewise-deforming", "Piecewise (deforming)", ("model=nasa", "condition=none"), cost=0.5),
     ),
     ("stick2d",),
     {"stick2d": ("stick", "stick_object", "stick_step10", "stick_step20", "stick_step30", "stick_step60")},
@@ -198,6 +199,12 @@ _STICK2D = Experiment(
     notes=(
         "stick: two bones; stick_object: two bones, a rigid object; stick_stepN: two bones, training angles N degrees apart.",
         "In distribution: angles as in training; out of distribution: larger angles.",
+        "Rigid parts cannot follow this stick. With inverse distances to the bones as weights, a bend moves a point sideways "
+        "by its distance from the axis times the sine of the angle, however far from the joint. The best rigid parts, found "
+        "without a network, are about as good as the trained ones; with inverse squared distances, rigid parts are much "
+        "better (benchmarks/bm_rigid_pieces.py).",
+        "The paper's text gives no numbers for Piecewise. It says piecewise rigid, but also a variant of NASA, whose parts "
+        "deform with the pose: both are here.",
     ),
 )
 

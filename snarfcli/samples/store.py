@@ -39,11 +39,13 @@ class SampleStore:
         self.manifest = manifest
         self.data: str = manifest["data"]
         self.subject: str = manifest["subject"]
+        self.is_planar: bool = manifest["settings"].get("is_planar", False)  # only samples of planar subjects have it
+        """Whether the subject is planar: all samples have z = 0."""
         check_sizes(folder, manifest["files"])
         arrays = read_arrays(folder / "subject.npz")
         try:
             self.skeleton: Skeleton = Skeleton.from_dict(arrays)
-            self.template: MeshTemplate | None = _template(arrays, self.skeleton.num_joints)
+            self.template: MeshTemplate | None = _template(arrays, self.skeleton.num_joints, self.is_planar)
             """Mesh of the subject in the canonical pose, float32; None if the data set has none."""
             self.betas: np.ndarray = checked_array(arrays, "betas", np.float32, (None,))
             """[S], float32, shape parameters of the body model; S is 0 without a body model."""
@@ -115,7 +117,7 @@ class SampleStore:
             sequence.verify()
 
 
-def _template(arrays: dict[str, np.ndarray], num_joints: int) -> MeshTemplate | None:
+def _template(arrays: dict[str, np.ndarray], num_joints: int, is_planar: bool) -> MeshTemplate | None:
     """Return the mesh in `subject.npz`, or None if it has none.
 
     Raises:
@@ -128,4 +130,4 @@ def _template(arrays: dict[str, np.ndarray], num_joints: int) -> MeshTemplate | 
     faces = checked_array(arrays, "faces", np.int32, (None, 3))
     if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise ValueError(f"faces: wanted vertices from 0 to {len(vertices) - 1}, got others")
-    return MeshTemplate(vertices, faces, weights)
+    return MeshTemplate(vertices, faces, weights, is_planar)

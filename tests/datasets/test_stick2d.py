@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -204,8 +205,24 @@ def test_fresh_points_are_of_the_plane_too(store: SampleStore) -> None:
 
 def test_manifest_says_that_the_samples_are_planar(store: SampleStore) -> None:
     assert store.manifest["settings"]["is_planar"] is True
+    assert store.is_planar
     assert store.template is not None
+    assert store.template.is_planar
     assert store.template.weights.shape[1] == 5
+
+
+def test_surface_vertices_of_a_stick_are_on_its_outline(store: SampleStore) -> None:
+    assert store.template is not None
+    on_surface = store.template.vertices[store.template.surface_vertices()].astype(np.float64)
+    assert len(on_surface) == 2 * (24 + 128) + 96
+    assert not on_surface[:, 2].any()
+    beyond_strip = np.abs(on_surface[:, :2]) - [_WIDE, _LONG]
+    on_strip = np.abs(beyond_strip.max(1)) < 1e-6
+    on_disk = np.abs(np.hypot(*(on_surface[:, :2] - _OBJECT).T) - _RADIUS) < 1e-6
+    assert (on_strip ^ on_disk).all()
+    assert on_disk.sum() == 96
+    solid = replace(store.template, is_planar=False)
+    np.testing.assert_array_equal(solid.surface_vertices(), np.arange(len(solid.vertices)))
 
 
 def test_other_subjects_keep_their_settings(tmp_path: Path) -> None:

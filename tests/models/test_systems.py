@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from toy_training import avatar_config, toy_store, training_config
 
 from snarfcli.avatar import Avatar
+from snarfcli.datasets.stick2d import stick_subject
 from snarfcli.deformer import CanonicalGrid, SearchConfig
 from snarfcli.deformer.skinning import skin
 from snarfcli.draws import GeneratorDraws
@@ -220,6 +221,21 @@ def test_surface_points_belong_to_one_part(store):
         occupancy = avatar.model.part_logits(posed[None], one[None])[0].sigmoid().T  # [N, J]
         wanted += F.mse_loss(occupancy, 0.5 * F.one_hot(template.weights[chosen].argmax(1), 2).float()) / len(transforms)
     torch.testing.assert_close(loss, 2.0 * wanted)
+
+
+def test_surface_points_of_a_planar_subject_are_on_its_outline():
+    """The top and the bottom of its prism are above and below the inside: a part is full there, not on its border."""
+    stick = stick_subject("stick")
+    config = replace(avatar_config(capsules=True), model=ModelConfig("nasa", part_points=4096))
+    surface = torch.tensor(stick.template.vertices, dtype=torch.float32)
+    grid = CanonicalGrid.around(surface, config.skinning.margin_m)
+    avatar = Avatar(config, stick.skeleton.to(torch.float32), grid, surface, {}, template=stick.template)
+    seen = []
+    avatar.model.part_logits = lambda points, *_: seen.append(points) or torch.zeros(1, avatar.model.num_bones, points.shape[1])
+    transforms = avatar.bone_transforms(torch.zeros(1, stick.skeleton.num_joints, 3))
+    avatar.model.extra_losses(transforms, torch.zeros(1, 4, 3), GeneratorDraws.seeded(0))
+    beyond = seen[0][0, :, :2].abs() - torch.tensor([0.15, 0.8])  # the outline of the strip, metres
+    torch.testing.assert_close(beyond.amax(1), torch.zeros(4096), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["pose_onet", "back_d", "nasa"])

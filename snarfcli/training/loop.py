@@ -37,15 +37,15 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
         on_scalars: called with the step and named numbers, for TensorBoard.
 
     Returns:
-        The last validation, the speed of this part of the run, and the time per step of all parts.
+        The last validation, the speed of this part of the run, and the time per step and the processor time of all parts.
     """
     config = trainer.config
-    first_step, seconds_before = trainer.step, trainer.seconds
-    start, shown_at = time.monotonic(), 0.0
+    first_step, seconds_before, processor_before = trainer.step, trainer.seconds, trainer.processor_s
+    start, processor_start, shown_at = time.monotonic(), time.process_time(), 0.0
     recent, written = History(_LAST_STEPS), first_step
     validation: dict[str, float] = {}
     points_per_step = config.poses_per_step * (config.uniform_points + config.surface_points)
-    paused = 0.0
+    paused = processor_paused = 0.0
     if is_due(first_step, config.validate_every) and not any(one["step"] == first_step for one in trainer.validations):
         trainer.validate()  # the run was interrupted between a checkpoint and this validation
 
@@ -57,6 +57,8 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
             recent.add(step, numbers)
             seconds = time.monotonic() - start - paused
             trainer.seconds = seconds_before + seconds
+            if processor_before is not None:
+                trainer.processor_s = processor_before + time.process_time() - processor_start - processor_paused
             speed = (step - first_step) / max(seconds, 1e-9)
             if step % _LAST_STEPS == 0 or last:
                 written = _write_scalars(on_scalars, recent, written, trainer, speed * points_per_step)
@@ -66,11 +68,12 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
             if interrupt:
                 raise interrupt.as_error()
             if validates:
-                before = time.monotonic()
+                before, processor_of_steps = time.monotonic(), time.process_time()
                 with interrupt.at_once():
                     validation = trainer.validate()
                 on_scalars(step, {f"validation_{name}": value for name, value in validation.items()})
                 paused += time.monotonic() - before
+                processor_paused += time.process_time() - processor_of_steps
             if shown is not None:
                 shown.update(step - shown.n)
             since = seconds + paused - shown_at
@@ -92,6 +95,7 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
         "seconds_this_run": round(seconds, 2),
         "validation_seconds": round(paused, 2),
         "seconds_per_step": round(trainer.seconds / trainer.step, 4) if trainer.step else None,
+        "processor_s": None if trainer.processor_s is None else round(trainer.processor_s, 2),
         "points_per_second": round(points_per_step * steps / seconds) if steps else None,
         "inside_without_correspondence": recent.means().get("inside_without_correspondence", 0.0),
     }

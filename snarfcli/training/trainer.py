@@ -95,6 +95,8 @@ class Trainer:
         """The coming step. Where steps run ahead of the host it may fall back in `settle`, as steps are taken again."""
         self.seconds = 0.0
         """Time that the steps have taken, in all parts of the run."""
+        self.processor_s: float | None = 0.0
+        """Processor time of the steps, of all threads and in all parts of the run; None if a part did not record it."""
         self.validations: list[dict[str, float]] = []
         """The validations so far: `step`, `seconds` of training, and the numbers of `validate`."""
 
@@ -258,6 +260,7 @@ class Trainer:
             "version": CHECKPOINT_VERSION,
             "step": self.step,
             "seconds": self.seconds,
+            "processor_s": self.processor_s,
             "validations": self.validations,
             "seed": self.seed,
             "avatar": self.avatar.to_dict(),
@@ -284,6 +287,8 @@ class Trainer:
             if self._ahead is not None:
                 self._ahead.follow()
             self.seconds = checked_seconds(state.get("seconds", 0.0))
+            processor_s = state.get("processor_s")
+            self.processor_s = None if processor_s is None else checked_seconds(processor_s)
             self.validations = checked_validations(state.get("validations", []))
             if state.get("draws_on_device", self._ahead is not None) != (self._ahead is not None):
                 log.info("other random numbers than before from here on: training.graph or the device has changed")

@@ -69,6 +69,7 @@ def test_the_run_folder_holds_all_that_a_run_should(config, caplog):
     }  # fmt: skip
     assert 0 <= metrics["iou_surface"] <= 1
     assert metrics["timings"]["points_per_second"] > 0
+    assert metrics["timings"]["processor_s"] > 0
     assert {"versions", "machine"} <= set(metrics)
     assert "steps: 6" in (folder / "config.yaml").read_text()
     assert Avatar.load(folder / "avatar.pt").facts["steps"] == 6

@@ -15,6 +15,7 @@ from snarfcli.bodies.extent import unpose_by_nearest_bone
 from snarfcli.errors import UserError
 from snarfcli.interrupts import SIGNALS, exit_code
 from snarfcli.models.checkpoint import load_checkpoint
+from snarfcli.training import loop
 from snarfcli.training.loop import train
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Trainer
 
@@ -136,6 +137,28 @@ def test_interrupt_ends_the_step_and_leaves_a_checkpoint(store, tmp_path, number
     again = trainer_for(store)
     again.restore(state, "checkpoint.pt")
     assert again.seconds == trainer.seconds > 0
+    assert again.processor_s == trainer.processor_s == state["processor_s"] > 0
+    again.restore({name: value for name, value in state.items() if name != "processor_s"}, "checkpoint.pt")
+    assert again.processor_s is None, "the first part of the run did not record it"
+    result = train(again, tmp_path, on_scalars=lambda step, numbers: None)
+    assert result["processor_s"] is None
+
+
+def test_the_processor_time_is_that_of_the_steps_of_all_parts(store, tmp_path, monkeypatch):
+    """Of a clock that a step moves by 3 s and a validation by 100 s."""
+    clock = [50.0]
+    trainer = trainer_for(store, steps=4, validate_every=2)
+    trainer.processor_s = 1000.0
+    advance, validate = trainer.advance, trainer.validate
+
+    def moving(call, seconds):
+        clock[0] += seconds
+        return call()
+
+    monkeypatch.setattr(loop.time, "process_time", lambda: clock[0])
+    monkeypatch.setattr(trainer, "advance", lambda: moving(advance, 3.0))
+    monkeypatch.setattr(trainer, "validate", lambda: moving(validate, 100.0))
+    assert train(trainer, tmp_path, on_scalars=lambda step, numbers: None)["processor_s"] == 1000.0 + 4 * 3.0
 
 
 def test_learning_rate_warms_up_and_falls(store):

@@ -81,6 +81,8 @@ class Job:
     """Evaluations after the training."""
     digest: str
     """Hash of all settings that the avatar depends on."""
+    minutes: float | None = None
+    """Budget of the training in minutes of one core, from which its number of steps follows; None: `train` has the number."""
 
     @property
     def name(self) -> str:

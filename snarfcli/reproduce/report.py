@@ -132,7 +132,9 @@ def _figures(plan: Plan, results: Sequence[Result], folder: Path, resolution: in
         ]
     else:
         draw = {"systems": figures.draw_systems, "weights": figures.draw_weights}
-        wanted = [(name, partial(draw[name], plan, results, folder, resolution)) for name in _DRAWN[plan.experiment.name]]
+        wanted = [
+            (name, partial(draw[name], plan, results, folder, resolution)) for name in _DRAWN.get(plan.experiment.name, ())
+        ]
         wanted.append(("sequences", partial(figures.draw_sequences, plan, results, folder)))
     drawn = []
     for name, make in wanted:

@@ -74,6 +74,7 @@ MORE_COLUMNS = (
            ("weights", "wrong_share"), 100),
     Column("right_bone", "right bone %", "vertices whose heaviest bone is the same as in the body model, %", "id",
            ("weights", "right_bone"), 100),
+    Column("steps", "steps", "number of training steps", "train", ("steps",), 1, 0),
 )  # fmt: skip
 """Columns of the second table; columns without a number are left out."""
 

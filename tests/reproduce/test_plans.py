@@ -117,7 +117,8 @@ def test_all_runs_what_experiments_share_once(tmp_path):
     chosen = choose_experiments("all", ExperimentOptions(data="dfaust", subjects=("50002",), training="paper"))
     assert [(one.name, part.data, part.subjects, part.training) for one, part in chosen] == [
         ("table1", "dfaust", ("50002",), "paper"), ("table2", "dfaust", ("50002",), "paper"),
-        ("ablations", "dfaust", ("50002",), "paper"), ("stick2d", None, (), None), ("clothed", "cape", (), "paper"),
+        ("ablations", "dfaust", ("50002",), "paper"), ("minutes", "dfaust", ("50002",), "paper"),
+        ("stick2d", None, (), None), ("clothed", "cape", (), "paper"),
     ]  # fmt: skip
     plans = [fake_plan(tmp_path, name) for name in ("table1", "table2", "ablations")]
     jobs = unique_jobs(plans)

@@ -33,8 +33,10 @@ def call(capsys, *arguments):
 
 
 WRONG = {
-    ("tabel1",): "what: wanted table1, table2, ablations, stick2d, clothed or all, got 'tabel1'; did you mean 'table1'?",
-    (): "what: wanted table1, table2, ablations, stick2d, clothed or all, got none",
+    (
+        "tabel1",
+    ): "what: wanted table1, table2, ablations, minutes, stick2d, clothed or all, got 'tabel1'; did you mean 'table1'?",
+    (): "what: wanted table1, table2, ablations, minutes, stick2d, clothed or all, got none",
     ("table1", "systems=[nsa]"): "there is no row 'nsa'; did you mean 'nasa'?",
     ("table1", "training=quik"): "there is no training=quik; did you mean 'quick'?",
     ("table1", "data=cap"): "data: wanted builtin or dfaust for table1, got 'cap'",

@@ -89,6 +89,8 @@ class Metrics:
     """The machine."""
     versions: dict[str, Any] = field(default_factory=dict)
     """Versions of packages."""
+    validations: list[dict[str, Any]] = field(default_factory=list)
+    """Validations of a training, with the number of steps before each."""
     content: dict[str, Any] = field(default_factory=dict)
     """The whole file."""
 

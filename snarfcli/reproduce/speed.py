@@ -22,7 +22,7 @@ SPEED_FOLDER = "speed"
 # every 4th has the loss for made-up poses, and one updates the cells. In training=quick, the steps 21 to 120 took 0.047 s of
 # one core each, and so did the steps 301 to 1,200.
 _UNCOUNTED, _STEPS = 20, 120
-_VALIDATIONS = 12  # of the training, for its curve
+_VALIDATIONS, _VALIDATION_FRAMES = 12, 8  # of the training, for its curve; rows with other presets have the same frames
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,12 @@ def measured_steps(job: Job) -> int:
 def timed_arguments(job: Job, steps: int) -> tuple[str, ...]:
     """Return the arguments of `snarf` for the training of a job with a budget, of which the number of steps is known."""
     given = {argument.partition("=")[0] for argument in job.train}
-    every = "training.validate_every"
-    curve = () if every in given else (f"{every}={max(1, steps // _VALIDATIONS)}",)
-    return (*job.train, f"training.steps={steps}", *curve)
+    curve = {
+        "training.validate_every": max(1, steps // _VALIDATIONS),
+        "training.validation_frames": _VALIDATION_FRAMES,
+    }
+    of_curve = (f"{name}={value}" for name, value in curve.items() if name not in given)
+    return (*job.train, f"training.steps={steps}", *of_curve)
 
 
 def _step_s(metrics: _Metrics) -> float:

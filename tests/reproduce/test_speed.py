@@ -66,10 +66,11 @@ def test_the_commands_have_one_thread_and_the_steps_that_fit(job):
     short = speed_arguments(job)
     assert short[: len(job.train)] == job.train
     assert short[-1] == f"output_root='{job.folder}/speed'", "the last one counts"
-    assert timed_arguments(job, 480) == (*job.train, "training.steps=480", "training.validate_every=40")
-    assert timed_arguments(job, 5)[-1] == "training.validate_every=1"
-    given = replace(job, train=(*job.train, "training.validate_every=7"))
-    assert timed_arguments(given, 480)[-1] == "training.steps=480"
+    curve = ("training.validate_every=40", "training.validation_frames=8")
+    assert timed_arguments(job, 480) == (*job.train, "training.steps=480", *curve)
+    assert "training.validate_every=1" in timed_arguments(job, 5)
+    given = replace(job, train=(*job.train, "training.validate_every=7", "training.validation_frames=3"))
+    assert timed_arguments(given, 480) == (*given.train, "training.steps=480")
 
 
 class Commands:

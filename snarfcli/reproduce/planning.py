@@ -121,11 +121,13 @@ def make_plan(experiment: Experiment, options: ExperimentOptions, resolve: Resol
 
 
 def _chosen_rows(experiment: Experiment, options: ExperimentOptions) -> list[Row]:
-    """Return the rows that `systems=` names, or all rows."""
+    """Return the rows that `systems=` names, or all that are not optional."""
     unknown = [key for key in options.systems if key not in [row.key for row in experiment.rows]]
     if unknown:
         raise UserError(_unknown_systems(unknown, experiment.rows))
-    return [row for row in experiment.rows if not options.systems or row.key in options.systems]
+    if options.systems:
+        return [row for row in experiment.rows if row.key in options.systems]
+    return [row for row in experiment.rows if not row.is_optional]
 
 
 def _job(

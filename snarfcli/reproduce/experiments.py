@@ -88,8 +88,8 @@ _SNARF_NOTE = (
     "With all presets except paper, SNARF searches from nine bones and uses an eighth of the points per step; the times of "
     "its rows are for these settings."
 )
-# As near to its own settings as an hour of one core allows with the 1,200 steps of training=quick: its search from all 24 bones
-# with at most 20 steps (conf/search/snarf.yaml), and 3,040 instead of 18,000 points per step, from 4 instead of 8 poses.
+# As near to its own settings as an hour of one core allows with the 1,200 steps of training=quick, 2.7 s each: its search from
+# all 24 bones with at most 20 steps (conf/search/snarf.yaml), and 3,040 instead of 18,000 points, from 4 instead of 8 poses.
 _SNARF_HOUR = Row(
     "snarf-hour", "SNARF, search from all bones", ("model=snarf", *_PAPERS),
     (*_NETWORKS, "search=snarf", "training.poses_per_step=4", "training.uniform_points=180", "training.surface_points=540",

@@ -1,23 +1,26 @@
-"""Progress of long tasks: a bar on a terminal, one line every 20 seconds in a log."""
+"""Progress of long tasks: a bar on a terminal, one line every 20 seconds in a log; or several lines that are replaced."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
-from snarfcli.texts import one_line
+from snarfcli.texts import one_line, terminal_text
 
-__all__ = ["progress", "progress_bar"]
+__all__ = ["ProgressLines", "progress", "progress_bar"]
 
 log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
 _LOG_EVERY_S = 20.0
 _LONGEST_NAME = 80
+_REDRAW_EVERY_S = 1.0
+_LOG_LINES_EVERY_S = 60.0
 
 
 def progress(items: Iterable[_Item], *, total: int | None = None, desc: str, unit: str = "it") -> Iterator[_Item]:
@@ -52,13 +55,58 @@ def progress_bar(*, total: int | None, done: int = 0, desc: str, unit: str) -> I
     Args:
         done: number of items that were done before.
     """
-    if sys.stderr is None or not sys.stderr.isatty() or find_spec("tqdm") is None:
+    if not _has_bars():
         yield None
         return
     from tqdm import tqdm
 
     with tqdm(file=_Terminal(), total=total, initial=done, desc=desc, unit=unit, dynamic_ncols=True) as bar:
         yield bar
+
+
+class ProgressLines:
+    """Lines about work with several parts: replaced every second on a terminal, logged once a minute otherwise."""
+
+    def __init__(self) -> None:
+        self._is_drawn = _has_bars()
+        self._bars: list[Any] = []  # of tqdm
+        self._shown_at: float | None = None if self._is_drawn else time.monotonic()
+
+    def is_due(self) -> bool:
+        """Return whether it is time for `show`."""
+        every_s = _REDRAW_EVERY_S if self._is_drawn else _LOG_LINES_EVERY_S
+        return self._shown_at is None or time.monotonic() - self._shown_at >= every_s
+
+    def show(self, lines: Sequence[str]) -> None:
+        """Show lines, in place of those before."""
+        self._shown_at = time.monotonic()
+        if not self._is_drawn:
+            log.info("%s", "\n".join(lines))
+            return
+        from tqdm import tqdm
+
+        width = shutil.get_terminal_size().columns - 1  # a longer line would break
+        while len(self._bars) < len(lines):
+            self._bars.append(tqdm(file=_Terminal(), position=len(self._bars), bar_format="{desc}", leave=False))
+        for index, bar in enumerate(self._bars):
+            bar.set_description_str(terminal_text(lines[index])[:width] if index < len(lines) else "")
+
+    def hide(self) -> None:
+        """Remove the lines from the terminal before something else is printed; they come back with the next `show`."""
+        for bar in self._bars:
+            bar.clear()
+        self._shown_at = None if self._is_drawn else self._shown_at
+
+    def close(self) -> None:
+        """Remove the lines for good."""
+        for bar in reversed(self._bars):
+            bar.close()
+        self._bars = []
+
+
+def _has_bars() -> bool:
+    """Return whether standard error is a terminal, and tqdm is installed to draw on it."""
+    return sys.stderr is not None and sys.stderr.isatty() and find_spec("tqdm") is not None
 
 
 class _Terminal:

@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["markdown_text", "one_line", "terminal_text"]
+__all__ = ["counted", "markdown_text", "one_line", "terminal_text"]
 
 _LAYOUT = "\n\t"  # the only control characters that text on a terminal needs
 _MARKS = re.compile(r"[^\w ,]|_")  # everything but letters of any script, digits, spaces and commas
+
+
+def counted(count: int, noun: str, plural: str | None = None) -> str:
+    """Return a number of things: "1 frame", "2 frames"; the plural is the noun with an s unless it is given."""
+    return f"{count} {noun if count == 1 else plural or noun + 's'}"
 
 
 def one_line(reason: str | BaseException, longest: int | None = None) -> str:

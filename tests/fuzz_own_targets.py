@@ -295,7 +295,8 @@ def _planned() -> Any:
 
     stage = EvaluationStage("id", "builtin", "data", ("eval", "subject=1"), "outputs/eval/metrics.json", {"max_frames": None})
     samples = (SamplesStage("data/processed/builtin/1", ("preprocess", "subject=1")),)
-    return Job("snarf", "SNARF", "builtin", "1", 0, "outputs/builtin/1/x", samples, ("train",), (stage,), "0" * 64)
+    folder, digest = "outputs/builtin/1/x", "0" * 64
+    return Job("snarf", "SNARF", "builtin", "1", 0, folder, samples, ("train",), (stage,), digest, digest[:16], 9, 1.0)
 
 
 def planned_job() -> Target:
@@ -326,6 +327,24 @@ def job_status() -> Target:
         return found
 
     return Target("job_status", ".json", lambda: [json.dumps(asdict(status)).encode()], read, damaged_json)
+
+
+def durations() -> Target:
+    """What `snarf reproduce` knows about the durations of runs."""
+    from tree_damage import damaged_json
+
+    from snarfcli.reproduce.durations import Durations, plan_seconds, time_text
+
+    job = _planned()
+    times = {"train_s": 60.0, "evaluations_s": 9.0, "train_processor_s": 60.0, "evaluations_processor_s": 9.0}
+    duration = {**times, "threads": 1, "machine": "a processor, 2 cores", "gpu": ""}
+    content = {"kinds": {job.kind: {"row": "SNARF", "runs": [duration], "steps": duration}}}
+
+    def read(path: Path) -> object:
+        estimate = Durations(path, [job], None, 1).of(job)
+        return time_text(plan_seconds([estimate.total_s, estimate.processor_s], 1))
+
+    return Target("durations", ".json", lambda: [json.dumps(content).encode()], read, damaged_json)
 
 
 def metrics() -> Target:
@@ -379,5 +398,5 @@ def mesh_obj() -> Target:
 
 
 OWN_TARGETS = (avatar, avatar_use, checkpoint, samples, resumed_samples, refined_poses, animation_record, planned_job,
-               job_status, metrics, mesh_ply, mesh_obj)  # fmt: skip
+               job_status, durations, metrics, mesh_ply, mesh_obj)  # fmt: skip
 """Functions that each return one target with the name of the function."""

@@ -5,9 +5,14 @@ from __future__ import annotations
 import html
 import re
 
-from snarfcli.texts import markdown_text, one_line, terminal_text
+from snarfcli.texts import counted, markdown_text, one_line, terminal_text
 
 HOSTILE = "a\x1b]0;title\x07\x1b[2J\r\u202eb\u2028\x9b31m\ud800"
+
+
+def test_counts_agree_with_their_nouns():
+    assert [counted(count, "frame") for count in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
+    assert [counted(count, "mesh", "meshes") for count in (1, 2)] == ["1 mesh", "2 meshes"]
 
 
 def test_one_line_has_neither_line_breaks_nor_control_characters():

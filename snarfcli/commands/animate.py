@@ -41,6 +41,7 @@ from snarfcli.rendering.stage import CAMERAS, body_points, set_stage
 from snarfcli.rendering.video import write_video
 from snarfcli.rendering.views import View, parse_turntable, parse_views
 from snarfcli.runs import machine_facts
+from snarfcli.texts import counted
 
 __all__ = ["AnimateConfig", "run"]
 
@@ -71,7 +72,7 @@ def run(config: AnimateConfig) -> int:
     processes = frame_processes(plan.processes, count, config.resolution, extract=on_cpu, draw=config.video)
     folder = Path(config.output) if config.output else path.parent / "animation" / folder_name(motion.name)
     log.info("avatar: %s, on %s", path, avatar.device)
-    log.info("motion: %s, %d frames at %g per second", motion.name, motion.num_frames, motion.frame_rate)
+    log.info("motion: %s, %s at %g per second", motion.name, counted(motion.num_frames, "frame"), motion.frame_rate)
     with hold_output(folder, "snarf animate", wait=config.wait):
         settings = frame_settings(config, path, chosen)
         prepare_folder(folder, settings, config.overwrite)
@@ -116,7 +117,7 @@ def _animate(
     )
     threads = max(1, (config.threads or count_cores()) // processes)
     if processes > 1:
-        log.info("%d processes %s", processes, f"of {threads} threads" if on_cpu else "draw")
+        log.info("%d processes %s", processes, f"of {counted(threads, 'thread')}" if on_cpu else "draw")
     pictures = make_pictures(animation, processes, threads, extracts_here=not on_cpu)
     try:
         if config.video:
@@ -126,7 +127,7 @@ def _animate(
                 pass
     except KeyboardInterrupt:
         done = len(animation.frames)
-        log.info("stopped after %d of %d frames; run the same command to continue", done, count)
+        log.info("stopped after %d of %s; run the same command to continue", done, counted(count, "frame"))
         raise
     record = _record(config, animation, motion, path, processes, time.perf_counter() - start)
     return animation, record | machine_facts(avatar.device)
@@ -273,8 +274,9 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
     skipped = sum(frame.problem is not None for frame in frames)
     kept = sum(frame.was_there for frame in frames)
     log.info(
-        "%d frames in %.1f s, %.2f frames per second%s",
-        len(frames), timings["total_s"], timings["frames_a_second"], f"; {kept} existed already" if kept else "",
+        "%s in %.1f s, %.2f frames per second%s",
+        counted(len(frames), "frame"), timings["total_s"], timings["frames_a_second"],
+        f"; {kept} existed already" if kept else "",
     )  # fmt: skip
     if config.meshes and skipped < len(frames):
         log.info("meshes: %s", folder / f"frame_*.{config.format}")
@@ -282,10 +284,11 @@ def _report(config: AnimateConfig, animation: Animation, timings: dict[str, floa
         log.info("video: %s, its middle frame: %s", folder / VIDEO, POSTER)
     pieces = sum((frame.components or 0) > 1 for frame in frames)
     if pieces:
-        log.info("%d frames have loose pieces; keep_share=0.1 removes all but large ones", pieces)
+        log.info("%s with loose pieces; keep_share=0.1 removes all but large ones", counted(pieces, "frame"))
     if skipped:
-        log.warning("%d of %d frames have no surface; see %s", skipped, len(frames), folder / RECORD)
+        log.warning("%d of %s without a surface; see %s", skipped, counted(len(frames), "frame"), folder / RECORD)
     incomplete = sum(bool(frame.missing) for frame in frames)
     if incomplete:
-        log.warning("%d of %d frames lack a panel beside the avatar; see %s", incomplete, len(frames), folder / RECORD)
+        of_frames = counted(len(frames), "frame")
+        log.warning("%d of %s without a panel beside the avatar; see %s", incomplete, of_frames, folder / RECORD)
     return 1 if skipped or incomplete else 0

@@ -21,7 +21,7 @@ from snarfcli.commands.doctor_findings import Finding, promises
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.parallel import count_cores
-from snarfcli.texts import one_line
+from snarfcli.texts import counted, one_line
 from snarfcli.versions import RECORDED_PACKAGES, installed_version
 
 __all__ = ["DoctorConfig", "Finding", "run"]
@@ -207,7 +207,7 @@ def _processor() -> Iterator[Finding]:
     from snarfcli.runs import machine_facts
 
     machine = machine_facts()["machine"]
-    yield Finding("model", f"{machine['processor']}, {machine['cores']} cores, {count_cores()} of them usable here")
+    yield Finding("model", f"{machine['processor']}, {counted(machine['cores'], 'core')}, {count_cores()} of them usable here")
     limit = os.environ.get("OMP_NUM_THREADS")
     yield Finding("threads", f"{machine['threads']} (PyTorch's number{f'; OMP_NUM_THREADS={limit}' if limit else ''})")
     yield _native()

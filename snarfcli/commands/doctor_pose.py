@@ -22,6 +22,7 @@ from snarfcli.motions.reader import read_motion_and_source
 from snarfcli.motions.retarget import Retargeted
 from snarfcli.motions.up_axis import Up
 from snarfcli.rendering.bones import PosedSkeleton, write_skeletons_figure
+from snarfcli.texts import counted
 
 __all__ = ["PoseQuestion", "check_pose"]
 
@@ -65,7 +66,8 @@ def check_pose(question: PoseQuestion, figure: Path) -> None:
         clip=question.clip,
     )
     seconds = motion.num_frames / motion.frame_rate
-    _tell("motion", f"{motion.name}: {motion.num_frames} frames at {motion.frame_rate:g} per second, {seconds:.1f} s")
+    frames = counted(motion.num_frames, "frame")
+    _tell("motion", f"{motion.name}: {frames} at {motion.frame_rate:g} per second, {seconds:.1f} s")
     if source is not None:
         _tell_pairs(skeleton, source)
     way = motion.translation[:, [0, 2]]

@@ -34,7 +34,7 @@ from snarfcli.precision import PRECISIONS
 from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.store import SampleStore
-from snarfcli.texts import one_line
+from snarfcli.texts import counted, one_line
 
 __all__ = ["EvalConfig", "run"]
 
@@ -116,8 +116,9 @@ def run(config: EvalConfig) -> None:
     folder = path.parent / _folder_name(config, avatar)
     _check_writable(folder)
     log.info(
-        "data: %s, subject %s, %s: %d sequences, %d frames",
-        store.data, store.subject, SPLITS[config.split], len(sequences), sum(s.num_frames for s in sequences),
+        "data: %s, subject %s, %s: %s, %s",
+        store.data, store.subject, SPLITS[config.split], counted(len(sequences), "sequence"),
+        counted(sum(s.num_frames for s in sequences), "frame"),
     )  # fmt: skip
     search = search_name(config.search) if config.search else avatar.model.search and avatar.model.search.name
     log.info("avatar: %s, %s, on %s", path, f"search {search}" if search else avatar.config.model.name, device)

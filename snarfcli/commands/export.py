@@ -34,6 +34,7 @@ from snarfcli.export.sequence import atomic_folder, write_sequence
 from snarfcli.export.vrm import export_vrm
 from snarfcli.meshing.mesh_files import MESH_WRITERS
 from snarfcli.runs import machine_facts, run_folder
+from snarfcli.texts import counted
 
 __all__ = ["ExportConfig", "run"]
 
@@ -71,7 +72,8 @@ def run(config: ExportConfig) -> int:
         raise UserError(f"usd: wanted one motion, got {len(clips)}; export them one by one, or give format=glb")
     log.info("avatar: %s, on %s", path, avatar.device)
     for clip in clips:
-        log.info("motion: %s, %d frames at %g per second", clip.motion.name, clip.motion.num_frames, clip.motion.frame_rate)
+        motion = clip.motion
+        log.info("motion: %s, %s at %g per second", motion.name, counted(motion.num_frames, "frame"), motion.frame_rate)
     files = clip_files(config, output, [clip.motion.name for clip in clips], "vrma") if config.format == "vrm" else []
     write = _write_meshes if config.format in MESH_WRITERS else _write_vrm if config.format == "vrm" else _write_character
     job = _Job(config, avatar, path, clips, options, output, files, blender, time.perf_counter())
@@ -174,5 +176,5 @@ def _write_meshes(job: _Job) -> _Written:
     with atomic_folder(job.output) as folder:
         skipped = write_sequence(folder, surface, job.clips, job.config.format, weight_colors=job.config.weight_colors)
         job.record(folder, {"frames": frames, "vertices": vertices, "triangles": triangles, "skipped": skipped})
-    lines = [f"{frames - len(skipped)} frames of {vertices} vertices and {triangles} triangles each in {job.output}"]
+    lines = [f"{counted(frames - len(skipped), 'frame')} of {vertices} vertices and {triangles} triangles each in {job.output}"]
     return lines, tuple(skipped)

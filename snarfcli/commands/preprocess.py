@@ -13,6 +13,7 @@ from omegaconf import MISSING
 
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
+from snarfcli.texts import counted
 
 __all__ = ["PreprocessConfig", "run"]
 
@@ -90,7 +91,7 @@ def run(config: PreprocessConfig) -> None:
     request = Request(config.data, Path(config.data_root), config.body)
     for subject in dataset.subjects(request) if config.subject == "all" else [config.subject]:
         data = dataset.load(subject, request)
-        log.info("subject %s of %s data, %d processes", data.subject, data.data, workers)
+        log.info("subject %s of %s data, %s", data.subject, data.data, counted(workers, "process", "processes"))
         for line in data.sources:
             log.info("from %s", line)
         for line in data.warnings:

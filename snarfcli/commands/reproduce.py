@@ -22,15 +22,21 @@ from snarfcli.files import remove_temporaries
 from snarfcli.hydra_config.overrides import check_overrides, readable
 from snarfcli.hydra_config.schema import config_folder, list_settings, preset_groups, register_schemas
 from snarfcli.output_locks import hold_output
-from snarfcli.reproduce.jobs import JobStatus, read_status
+from snarfcli.parallel import count_cores
+from snarfcli.reproduce.dry_run import measure_missing, print_commands, print_durations
+from snarfcli.reproduce.durations import Durations, longest_first, machine_name
+from snarfcli.reproduce.growing import GrowingReports, PlannedReport
 from snarfcli.reproduce.launchers import LAUNCHERS, Launcher
 from snarfcli.reproduce.launching import check_launcher, default_processes, launch
 from snarfcli.reproduce.planning import choose_experiments, make_plan
 from snarfcli.reproduce.plans import ExperimentOptions, Job, Plan, unique_jobs
+from snarfcli.reproduce.progress import PlanProgress
+from snarfcli.reproduce.provenance import code_versions
 from snarfcli.reproduce.report import write_report
-from snarfcli.reproduce.results import Result, collect
+from snarfcli.reproduce.results import collect
 from snarfcli.reproduce.tables import plain_table
-from snarfcli.runs import check_device
+from snarfcli.runs import check_device, machine_facts
+from snarfcli.texts import counted
 
 __all__ = ["ReproduceConfig", "resolve_training", "run"]
 
@@ -90,7 +96,9 @@ class ReproduceConfig:
     only_report: bool = MISSING
     """Run nothing; write tables and figures of the existing results."""
     dry_run: bool = MISSING
-    """Print the commands that would be run, and stop."""
+    """Print the commands that would be run and how long they would take, and stop."""
+    measure: bool = MISSING
+    """With dry_run, measure a short run of every row that has no finished one; false for an estimate at once."""
 
 
 def run(config: ReproduceConfig) -> int:
@@ -111,36 +119,74 @@ def run(config: ReproduceConfig) -> int:
     jobs = unique_jobs(plans)
     processes = config.processes or default_processes(config.launcher, len(jobs), config.device)
     launcher = Launcher(config.launcher, processes, config.threads, tuple(config.launcher_settings))
+    work = Path(config.output_root) / "reproduce"
+    # The machines of a cluster are not this one, so what runs there is not measured here.
+    machine = None if launcher.name == "submitit_slurm" else machine_name(machine_facts()["machine"])
+    threads = launcher.threads or max(1, count_cores() // launcher.processes)
+    durations = Durations(work / "durations.json", jobs, machine, threads)
+    jobs = longest_first(jobs, durations)
     if config.dry_run:
-        _print_plan(jobs)
+        print_commands(jobs)
+        if config.measure and machine is not None:
+            measure_missing(plans, jobs, durations)
+        print_durations(jobs, durations, launcher.processes)
         return 0
-    folders = [_report_folder(config, plan) for plan in plans]
-    for folder in folders:
-        folder.mkdir(parents=True, exist_ok=True)  # fails before the work if it cannot be written
+    about = f"{launcher.processes} runs at a time" if launcher.processes > 1 and not config.only_report else ""
+    reports = [PlannedReport(plan, _report_folder(config, plan), _command(config), about) for plan in plans]
+    for report in reports:
+        report.folder.mkdir(parents=True, exist_ok=True)  # fails before the work if it cannot be written
     if not config.only_report:
-        log.info("%d runs, launcher %s, %d at a time", len(jobs), config.launcher, processes)
-        progress = _Progress(jobs, processes)
-        try:
-            launch(jobs, Path(config.output_root) / "reproduce" / "jobs", launcher, progress)
-        except KeyboardInterrupt:
-            log.info("stopped with %d of %d runs done; run the same command to continue", progress.done, len(jobs))
-            raise
-    results: list[Result] = []
-    for plan, folder in zip(plans, folders, strict=True):
-        of_plan = [collect(job) for job in plan.jobs]
-        results += of_plan
-        log.info("\n%s\n\n%s\n", plan.experiment.title, plain_table(plan, of_plan))
-        undone = sum(result.state != "done" for result in of_plan)
-        if undone:
-            log.warning("warning: %d of %d runs are not done, so the exit code is 1; the report says why", undone, len(of_plan))
-        resolution = config.figure_resolution if config.figures else None
-        about = f"{processes} runs at a time" if processes > 1 and not config.only_report else ""
-        with hold_output(folder, "snarf reproduce", wait=True):
-            remove_temporaries(folder, recursive=True)
-            written = write_report(plan, of_plan, folder, _command(config), about=about, figure_resolution=resolution)
-        for path in written:
-            log.info("written: %s", path)
-    return 0 if all(result.state == "done" for result in results) else 1
+        _run_jobs(jobs, launcher, durations, reports, work / "jobs")
+    resolution = config.figure_resolution if config.figures else None
+    are_done = [_finish(report, resolution) for report in reports]
+    return 0 if all(are_done) else 1
+
+
+def _run_jobs(
+    jobs: Sequence[Job], launcher: Launcher, durations: Durations, reports: Sequence[PlannedReport], folder: Path
+) -> None:
+    """Run what is missing, show the progress, and let the reports grow."""
+    growing = GrowingReports(reports)
+
+    def grow(number: int) -> None:
+        growing.update(jobs[number].folder, {jobs[other].folder for other in progress.running})
+
+    progress = PlanProgress(jobs, launcher.processes, durations, grow)
+    log.info("launcher %s, %s at a time", launcher.name, counted(launcher.processes, "run"))
+    progress.begin()
+    try:
+        launch(jobs, folder, launcher, progress.on_change, progress.look)
+    except KeyboardInterrupt:
+        progress.close()
+        growing.stop()
+        log.info("stopped with %d of %s done; run the same command to continue", progress.done, counted(len(jobs), "run"))
+        raise
+    finally:
+        progress.close()
+
+
+def _finish(report: PlannedReport, figure_resolution: int | None) -> bool:
+    """Print the table of a plan, write its report, and return whether all its runs are done."""
+    plan, results = report.plan, [collect(job) for job in report.plan.jobs]
+    log.info("\n%s\n\n%s\n", plan.experiment.title, plain_table(plan, results))
+    undone = sum(result.state != "done" for result in results)
+    if undone:
+        runs = counted(len(results), "run")
+        log.warning("warning: %d of %s not done, so the exit code is 1; the report says why", undone, runs)
+    versions = code_versions(results)
+    if len(versions) > 1:
+        log.warning(
+            "warning: the runs are from %d versions of the code (%s); the report lists them; to have one version, delete the "
+            "folders of the other runs, or give another output_root", len(versions), "; ".join(versions),
+        )  # fmt: skip
+    with hold_output(report.folder, "snarf reproduce", wait=True):
+        remove_temporaries(report.folder, recursive=True)
+        written = write_report(
+            plan, results, report.folder, report.command, about=report.about, figure_resolution=figure_resolution
+        )
+    for path in written:
+        log.info("written: %s", path)
+    return not undone
 
 
 def resolve_training(overrides: Sequence[str]) -> dict[str, Any]:
@@ -195,26 +241,13 @@ def _report_folder(config: ReproduceConfig, plan: Plan) -> Path:
     return Path(config.report) / name if config.what == "all" else Path(config.report)
 
 
-def _print_plan(jobs: Sequence[Job]) -> None:
-    """Print each run and its commands."""
-    made: set[str] = set()
-    for number, job in enumerate(jobs, 1):
-        log.info("run %d of %d: %s: %s, %s", number, len(jobs), job.row, job.name, job.folder)
-        for samples in job.samples:
-            if samples.folder not in made and not (Path(samples.folder) / "manifest.json").exists():
-                log.info("  snarf %s", " ".join(samples.arguments))
-            made.add(samples.folder)
-        for arguments in (job.train, *(evaluation.arguments for evaluation in job.evaluations)):
-            log.info("  snarf %s", " ".join(arguments))
-
-
 def _command(config: ReproduceConfig) -> str:
     """Return the command line, with the settings that differ from the defaults."""
     path = config_folder() / "reproduce" / "reproduce.yaml"
     defaults = cast(dict[str, Any], OmegaConf.to_container(OmegaConf.load(path)))
     words = ["snarf", "reproduce", str(config.what)]
     for name, value in asdict(config).items():
-        if name not in ("what", "only_report", "dry_run") and value != defaults[name]:
+        if name not in ("what", "only_report", "dry_run", "measure") and value != defaults[name]:
             word = f"{name}={_written(value)}"
             words.append(word if re.fullmatch(r"[\w.,=/:+\-\[\]]*", word) else shlex.quote(word))
     return " ".join(words)
@@ -224,51 +257,3 @@ def _written(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ",".join(map(str, value)) + "]"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-
-
-class _Progress:
-    """Prints one line when a run starts, and one when it ends."""
-
-    def __init__(self, jobs: Sequence[Job], processes: int) -> None:
-        self.jobs, self.processes = jobs, processes
-        self.done = 0
-        self._ended: set[int] = set()
-        self._worked_s: list[float] = []
-
-    def __call__(self, number: int, status: JobStatus) -> None:
-        job = self.jobs[number]
-        if status.state == "running":
-            log.info("started: %s (%s)", job.name, Path(job.folder) / "reproduce.log")
-            return
-        if status.state == "stopped" or status.retry:
-            return
-        self._ended.add(number)
-        self.done += status.state == "done"
-        seconds = sum(status.seconds.values())
-        if seconds:
-            self._worked_s.append(seconds)
-        log.info("%d of %d: %s: %s%s", len(self._ended), len(self.jobs), job.name, self._outcome(job, status), self._left())
-
-    def _outcome(self, job: Job, status: JobStatus) -> str:
-        if status.state != "done":
-            return f"{status.state} ({status.stage}: {status.reason})" if status.reason else status.state
-        values = collect(job).values
-        parts = [
-            f"{name} " + "/".join(f"{values[key]:.1f}" if key in values else "-" for key in (f"{name}_id", f"{name}_ood"))
-            for name in ("bbox", "surface")
-        ]
-        seconds = sum(status.seconds.values())
-        return ", ".join([*parts, "IoU in/out of distribution", f"{seconds:.0f} s" if seconds else "existed already"])
-
-    @staticmethod
-    def _is_there(job: Job) -> bool:
-        status = read_status(Path(job.folder))
-        return status is not None and status.state == "done" and status.digest == job.digest
-
-    def _left(self) -> str:
-        """Return an estimate of the remaining time, from the mean duration of the finished runs."""
-        left = sum(number not in self._ended and not self._is_there(job) for number, job in enumerate(self.jobs))
-        if not left or not self._worked_s:
-            return ""
-        seconds = sum(self._worked_s) / len(self._worked_s) * left / min(self.processes, left)
-        return f"; about {seconds / 60:.0f} min left" if seconds >= 60 else f"; about {seconds:.0f} s left"

@@ -34,6 +34,7 @@ from snarfcli.output_locks import hold_all_inside, hold_output
 from snarfcli.runs import choose_device, machine_facts, run_folder, seed_everything, set_threads
 from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.store import SampleStore
+from snarfcli.texts import counted
 from snarfcli.training.loop import train
 from snarfcli.training.rough_shape import rough_canonical_points
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Diverged, Trainer
@@ -75,10 +76,11 @@ def _prepare(config: TrainConfig, folder: Path, device: torch.device) -> Trainer
         require_subject(config.subject)
     store = SampleStore.open(config.data_root, config.data.name, config.subject)
     sequences = store.sequences("train")
-    frames = sum(len(sequence.train_frames) for sequence in sequences)
+    frames = counted(sum(len(sequence.train_frames) for sequence in sequences), "frame")
     if config.training.validation_ood_frames:
         store.sequences("ood")  # raises if there are none
-    log.info("data: %s, subject %s, %d sequences, %d frames to train on", store.data, store.subject, len(sequences), frames)
+    among = counted(len(sequences), "sequence")
+    log.info("data: %s, subject %s, %s, %s to train on", store.data, store.subject, among, frames)
     if config.search.backend == "native":
         choose_backend("native", device)  # raises before anything is written
     try:
@@ -116,7 +118,8 @@ def _train(config: TrainConfig, folder: Path, trainer: Trainer) -> None:
     """Run all remaining steps and write the results."""
     _write_config(folder, config)
     parameters = sum(p.numel() for p in trainer.optimizer.parameters)
-    log.info("run: %s, %s parameters, %d steps on %s", folder, f"{parameters:,}", config.training.steps, trainer.device)
+    steps = counted(config.training.steps, "step")
+    log.info("run: %s, %s parameters, %s on %s", folder, f"{parameters:,}", steps, trainer.device)
 
     start = time.time()
     with _Scalars(folder, trainer.step) as on_scalars:

@@ -38,6 +38,7 @@ from snarfcli.motions import read_shape
 from snarfcli.motions.layouts import HANDS
 from snarfcli.motions.up_axis import UPS, Up
 from snarfcli.names import folder_names
+from snarfcli.texts import counted
 
 __all__ = ["load", "subjects"]
 
@@ -80,7 +81,7 @@ def load(subject: str, request: Request) -> SubjectData:
     broken = [*unreadable.items(), *broken]
     if not sequences:
         raise UserError(_first_reason(broken))
-    sources = (*person.sources, f"motions: {len(files)} files in {place}")
+    sources = (*person.sources, f"motions: {counted(len(files), 'file')} in {place}")
     if "test" not in splits.values():
         count = len(sequences)
         sequences = _hold_back_ends(sequences, person)

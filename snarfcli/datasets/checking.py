@@ -20,7 +20,7 @@ from snarfcli.errors import UserError
 from snarfcli.sampling import check_mesh
 from snarfcli.sampling.occupancy import winding_numbers
 from snarfcli.segments import distance_to_segments
-from snarfcli.texts import one_line
+from snarfcli.texts import counted, one_line
 
 __all__ = ["ExaminedFrame", "Remark", "check_subject"]
 
@@ -131,12 +131,13 @@ def _about_skeleton(skeleton: Skeleton) -> Iterator[Remark]:
     roots = sum(parent < 0 for parent in skeleton.parents)
     lengths = [float((skeleton.joints_rest[a] - skeleton.joints_rest[b]).norm()) for a, b in skeleton.bones]
     turned = int((skeleton.canonical_pose.abs().amax(1) > 1e-6).sum())
-    canonical = f"{turned} joints turned" if turned else "the rest pose"
+    canonical = f"{counted(turned, 'joint')} turned" if turned else "the rest pose"
     tops = f", {roots} roots" if roots > 1 else ""
-    yield Remark("skeleton", f"{skeleton.num_joints} joints, {len(lengths)} bones{tops}; canonical pose: {canonical}")
+    joints, bones = counted(skeleton.num_joints, "joint"), counted(len(lengths), "bone")
+    yield Remark("skeleton", f"{joints}, {bones}{tops}; canonical pose: {canonical}")
     short = sum(length < 1e-6 for length in lengths)
     if short:
-        text = f"{short} bones have length 0; this works, but their joints need weights and time"
+        text = f"{counted(short, 'bone')} of length 0; this works, but their joints need weights and time"
         yield Remark("skeleton", text, "warning")
     if skeleton.num_joints > 100:
         text = "over 100 joints: the time of training grows with each; leave out joints that hardly move"
@@ -148,11 +149,11 @@ def _about_sequences(data: SubjectData) -> Iterator[Remark]:
         yield Remark("broken", f"{name}: {reason}; repair it, or give skip_broken=true to preprocess", "problem")
     for spec in data.sequences[:_LISTED]:
         kept = ", bone transforms as given" if spec.posed_from_rest is not None else ""
-        text = f"{spec.name}: {spec.motion.num_frames} frames at {spec.motion.frame_rate:g} per second{kept}"
+        text = f"{spec.name}: {counted(spec.motion.num_frames, 'frame')} at {spec.motion.frame_rate:g} per second{kept}"
         yield Remark(spec.split, text)
     more = len(data.sequences) - _LISTED
     if more > 0:
-        yield Remark("", f"and {more} more sequences")
+        yield Remark("", f"and {counted(more, 'more sequence')}")
     if not data.of_split("train"):
         yield Remark("train", "no sequence to train on; add one, or hold out fewer in data.test", "problem")
     if not data.of_split("test"):
@@ -163,7 +164,8 @@ def _about_meshes(seen: list[ExaminedFrame], open_edges: list[int]) -> Iterator[
     counts = [(len(entry.vertices), len(entry.faces)) for entry in seen]
     sides = [float(np.ptp(entry.vertices, axis=0).max()) for entry in seen]
     same = "the same in all" if len(set(counts)) == 1 else f"{min(counts)[0]} to {max(counts)[0]} vertices in"
-    text = f"{counts[0][0]} vertices, {counts[0][1]} faces, {same} {len(seen)} frames examined; {_range(sides)} m long"
+    examined = f"{counted(len(seen), 'frame')} examined"
+    text = f"{counts[0][0]} vertices, {counts[0][1]} faces, {same} {examined}; {_range(sides)} m long"
     yield Remark("meshes", text)
     if any(open_edges):
         share = sum(count > 0 for count in open_edges)
@@ -217,7 +219,8 @@ def _about_poses(skeleton: Skeleton, seen: list[ExaminedFrame]) -> Iterator[Rema
     if fit is None:
         return
     moved, allowed = (f"{100 * length:.1f} cm" for length in (fit.moved_m, _MOVED_AT_BONES * fit.length_m))
-    text = f"surface at a bone moves by {moved} between frames (median of {fit.bones} bones, {fit.frames} frames)"
+    seen_in = f"{counted(fit.bones, 'bone')}, {counted(fit.frames, 'frame')}"
+    text = f"surface at a bone moves by {moved} between frames (median of {seen_in})"
     if fit.moved_m < _MOVED_AT_BONES * fit.length_m:
         yield Remark("poses", text)
     else:

@@ -69,6 +69,7 @@ from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
 from snarfcli.formats.surfaces import list_surfaces, read_surface
 from snarfcli.names import folder_names
+from snarfcli.texts import counted
 
 __all__ = ["load", "subjects"]
 
@@ -125,7 +126,7 @@ def _load_meshes(subject: str, folder: Path, config: DataConfig) -> SubjectData:
     scale, why = person_scale(length, whole, config.scale, skeleton.scale)
     up = config.up if config.up != "auto" else skeleton.up or "y"
     warnings = _about_angles(recordings)
-    sources = (f"skeleton {source}, {len(skeleton.names)} joints", _conversion_text(why, up))
+    sources = (f"skeleton {source}, {counted(len(skeleton.names), 'joint')}", _conversion_text(why, up))
     return _subject(
         subject, skeleton, FileToWorld(scale, up), recordings, folder, config, sources, warnings, broken=tuple(broken)
     )
@@ -205,10 +206,11 @@ def _load_rigged(subject: str, place: Path, paths: list[Path], config: DataConfi
         transforms = world.transforms(poses.posed_from_rest)
         recordings.append(RecordedSequence(name, poses, RigMeshes(vertices, mesh.faces, mesh.weights, transforms)))
     files = str(place) if len(paths) == 1 else f"{len(paths)} files in {place}"
-    sources = [f"rigged file {files}: {len(skeleton.names)} joints, {len(mesh.vertices)} vertices, {len(recordings)} motions"]
+    joints, motions = counted(len(skeleton.names), "joint"), counted(len(recordings), "motion")
+    sources = [f"rigged file {files}: {joints}, {len(mesh.vertices)} vertices, {motions}"]
     if rigged.dropped:
         some = ", ".join(rigged.dropped[:4]) + (", ..." if len(rigged.dropped) > 4 else "")
-        sources.append(f"{len(rigged.dropped)} end joints that move no vertex were left out ({some})")
+        sources.append(f"left out {counted(len(rigged.dropped), 'end joint')} without vertices ({some})")
     if skeleton.idle:
         some = ", ".join(skeleton.names[joint] for joint in skeleton.idle[:4]) + (", ..." if len(skeleton.idle) > 4 else "")
         sources.append(f"joints that only place others, and move no vertex, get no weights and no shape: {some}")

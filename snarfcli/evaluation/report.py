@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from snarfcli.evaluation.metrics import FrameMetrics, Summary, group_by_sequence, mean_of_sequences, summarise
+from snarfcli.texts import counted
 
 __all__ = [
     "PROTOCOL",
@@ -121,17 +122,13 @@ def timings_text(evaluation: EvaluationReport) -> str:
     """Return two lines: times for the number of points of the papers' table; device and total time."""
     times = _timings(evaluation)
     machine = evaluation.machine["machine"]
-    threads, frames = _counted(machine["threads"], "thread"), _counted(len(evaluation.frames), "frame")
+    threads, frames = counted(machine["threads"], "thread"), counted(len(evaluation.frames), "frame")
     where = machine["gpu"] if times["device"] != "cpu" and "gpu" in machine else threads
     return (
         f"time for {REFERENCE_POINTS:,} points: search {times['search_ms_per_200k']:.1f} ms, "
         f"shape {times['shape_ms_per_200k']:.1f} ms, total {times['total_ms_per_200k']:.1f} ms\n"
         f"{frames} in {evaluation.wall_s:.1f} s on {times['device']}, {where}"
     )
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" + ("" if count == 1 else "s")
 
 
 def _timings(evaluation: EvaluationReport) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from snarfcli.models.trained_field import TrainedField
 from snarfcli.progress import progress
 from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.sampling.triangles import area_normals, random_points_in
+from snarfcli.texts import counted
 
 __all__ = ["F_SCORE_DISTANCE_M", "SurfaceMetrics", "compare_surfaces", "measure_surfaces", "sample_surface", "surfaces_text"]
 
@@ -78,9 +79,9 @@ def surfaces_text(surfaces: Mapping[str, Any]) -> str:
     """Return the results of `measure_surfaces` as one line."""
     frames = surfaces["frames"] - surfaces["frames_without_surface"]
     if not frames:
-        return f"surfaces: none in {surfaces['frames']} frames"
+        return f"surfaces: none in {counted(surfaces['frames'], 'frame')}"
     return (
-        f"surfaces of {frames} frames at resolution {surfaces['resolution']}: Chamfer distance "
+        f"surfaces of {counted(frames, 'frame')} at resolution {surfaces['resolution']}: Chamfer distance "
         f"{1000 * surfaces['chamfer_m']:.2f} mm, normal consistency {surfaces['normal_consistency']:.4f}, "
         f"F-score at {1000 * F_SCORE_DISTANCE_M:g} mm {100 * surfaces['f_score']:.2f} %"
     )

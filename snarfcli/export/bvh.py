@@ -27,6 +27,7 @@ from snarfcli.motions import Motion
 from snarfcli.motions.joint_names import find_body_parts
 from snarfcli.motions.up_axis import y_from_up
 from snarfcli.names import unique_names
+from snarfcli.texts import counted
 
 __all__ = ["BVH_ORDERS", "UNITS", "BvhOptions", "BvhReport", "bvh_motion", "export_bvh"]
 
@@ -78,9 +79,9 @@ class BvhReport:
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
         seconds = (self.frames - 1) / self.frame_rate
+        joints, frames = counted(self.joints, "joint"), counted(self.frames, "frame")
         return [
-            f"{self.path}: {self.joints} joints, {self.frames} frames, {seconds:.2f} s at {self.frame_rate:g} per second, "
-            f"{self.num_bytes / 1e6:.2f} MB"
+            f"{self.path}: {joints}, {frames}, {seconds:.2f} s at {self.frame_rate:g} per second, {self.num_bytes / 1e6:.2f} MB"
         ]
 
 

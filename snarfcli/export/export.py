@@ -15,6 +15,7 @@ from snarfcli.export.character_glb import write_character
 from snarfcli.export.character_surface import character_surface
 from snarfcli.export.clips import Clip
 from snarfcli.models.trained_field import TrainedField
+from snarfcli.texts import counted
 
 __all__ = ["ClipReport", "ExportReport", "check_output", "export_character", "report_of"]
 
@@ -77,11 +78,11 @@ class ExportReport:
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
         moved, left = self.shape_motion_mm, self.morph_error_mm
-        clips = ", ".join(f"{c.name} ({c.frames} frames, {c.seconds:.2f} s at {c.frame_rate:g})" for c in self.clips)
+        clips = ", ".join(f"{c.name} ({counted(c.frames, 'frame')}, {c.seconds:.2f} s at {c.frame_rate:g})" for c in self.clips)
         return [
-            f"mesh: {self.vertices} vertices, {self.triangles} triangles; {self.joints} joints",
+            f"mesh: {self.vertices} vertices, {self.triangles} triangles; {counted(self.joints, 'joint')}",
             f"clips: {clips}",
-            f"{self.influences} influences instead of {self.joints}: {_millimetres(self.truncation_mm)}",
+            f"{counted(self.influences, 'influence')} instead of {self.joints}: {_millimetres(self.truncation_mm)}",
             f"pose-dependent shape: moves vertices by {moved['rms_mm']:.2f} mm (rms), {moved['max_mm']:.2f} mm at most; "
             f"{self.morph_targets} morph targets explain {100 * self.morph_share:.1f} % and leave {_millimetres(left)}",
             f"all together, against the avatar's skinned surface: {_millimetres(self.deviation_mm)}",

@@ -19,6 +19,7 @@ from snarfcli.fitting.pose_fit import CanonicalPoints, FittedPoses, PoseFit, Sur
 from snarfcli.models.file_tensors import read_tensor
 from snarfcli.samples.sequence import Frame, SequenceSamples
 from snarfcli.sampling import oriented_surface_samples
+from snarfcli.texts import counted
 
 __all__ = ["RefinedPoses", "refined_poses_text"]
 
@@ -34,8 +35,9 @@ def refined_poses_text(summary: Mapping[str, float]) -> str:
     """Return the content of `RefinedPoses.summary` as one line."""
     if not summary:
         return "poses: none was refined"
+    frames = counted(int(summary["frames"]), "frame")
     return (
-        f"poses of {summary['frames']} frames refined: turned by {summary['turn_deg']:.1f} degrees per joint and moved by "
+        f"poses of {frames} refined: turned by {summary['turn_deg']:.1f} degrees per joint and moved by "
         f"{100 * summary['shift_m']:.1f} cm (means); meshes are {1000 * summary['distance_m']:.1f} mm from the avatar (median)"
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.errors import UserError
+from snarfcli.texts import counted
 
 __all__ = ["BvhJoint", "BvhLines", "read_hierarchy", "read_number", "shown"]
 
@@ -115,7 +116,7 @@ def read_hierarchy(lines: BvhLines) -> list[BvhJoint]:
         else:
             raise lines.error(f"wanted OFFSET, CHANNELS, JOINT, End Site or a brace, got {shown(word[0])}")
     if open_joints:
-        raise lines.error(f"the braces of {len(open_joints)} joints are not closed")
+        raise lines.error(f"the braces of {counted(len(open_joints), 'joint')} are not closed")
     if not joints:
         raise lines.error("there is no ROOT")
     return joints

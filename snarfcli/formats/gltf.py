@@ -22,6 +22,7 @@ from snarfcli.formats.gltf_nodes import NodeTree, ShownMesh
 from snarfcli.formats.gltf_place import placed_skins
 from snarfcli.formats.gltf_skin import Skin, check_transforms, read_used_skins
 from snarfcli.formats.rig import Rig, RigMesh
+from snarfcli.texts import counted
 
 __all__ = ["GLTF_SUFFIXES", "read_gltf", "read_gltf_surface"]
 
@@ -172,7 +173,7 @@ def _report_left_out(file: GltfFile, left_out: Sequence[tuple[str, str]], num_cl
     if not num_clips:
         file.fail(left_out[0][1])
     shown = "; ".join(f"{name[:40]!a}: {reason}" for name, reason in left_out[:_LISTED])
-    log.warning("%s: %d motions cannot be used and were left out (%s)", file.path.name, len(left_out), shown)
+    log.warning("%s: left out %s that cannot be used (%s)", file.path.name, counted(len(left_out), "motion"), shown)
 
 
 def _rig_mesh(file: GltfFile, pieces: list[Piece], num_joints: int) -> RigMesh | None:
@@ -257,5 +258,5 @@ def _rest_and_pieces(
         count = len(piece.vertices)
         pieces.append(replace(piece, joints=np.full((count, 1), column[joint]), weights=np.ones((count, 1))))
     if left_out:
-        log.info("%s: %d meshes without a joint were left out", file.path.name, left_out)
+        log.info("%s: left out %s without a joint", file.path.name, counted(left_out, "mesh", "meshes"))
     return np.stack([rest[joint] for joint in joints]), pieces

@@ -29,6 +29,8 @@ class Row:
     """Budget of the training in minutes of one core, from which its number of steps follows; None: the steps of the preset."""
     is_optional: bool = False
     """Whether the row is only in the table if `systems=` names it."""
+    cost: float = 2.0
+    """Rough processor time of one run with training=quick, minutes: orders the runs before anything is measured."""
 
     def settings(self, training: str) -> tuple[str, ...]:
         """Return the settings of `snarf train` with one of its training presets."""
@@ -70,20 +72,22 @@ _OURS = ("model=fast_snarf", "search=complete")
 # networks and no such loss.
 _NETWORKS = ("shape=small", "skinning=coarse", "training.agreement_weight=0.0")
 
-_POSE_ONET = Row("pose_onet", "Pose-ONet", ("model=pose_onet", *_PAPERS), _NETWORKS, "pose_onet")
-_BACK_D = Row("back_d", "Back-D", ("model=back_d", *_PAPERS), _NETWORKS, "back_d")
+_POSE_ONET = Row("pose_onet", "Pose-ONet", ("model=pose_onet", *_PAPERS), _NETWORKS, "pose_onet", cost=3.2)
+_BACK_D = Row("back_d", "Back-D", ("model=back_d", *_PAPERS), _NETWORKS, "back_d", cost=4.0)
 # In the papers its weights have no prior; our presets start from the distances to the bones, which makes another system.
 _NO_PRIOR = "skinning.prior_falloff_m=null"
-_BACK_LBS = Row("back_lbs", "Back-LBS", ("model=back_lbs", _NO_PRIOR, *_PAPERS), _NETWORKS, "back_lbs")
-_BACK_LBS_PRIOR = Row("back_lbs-prior", "Back-LBS, weights start from the bones", ("model=back_lbs", *_PAPERS), _NETWORKS)
-_NASA = Row("nasa", "NASA", ("model=nasa", *_PAPERS), _NETWORKS, "nasa")
+_BACK_LBS = Row("back_lbs", "Back-LBS", ("model=back_lbs", _NO_PRIOR, *_PAPERS), _NETWORKS, "back_lbs", cost=3.6)
+_BACK_LBS_PRIOR = Row(
+    "back_lbs-prior", "Back-LBS, weights start from the bones", ("model=back_lbs", *_PAPERS), _NETWORKS, cost=4.0
+)
+_NASA = Row("nasa", "NASA", ("model=nasa", *_PAPERS), _NETWORKS, "nasa", cost=7.5)
 # A step of the presets takes 12 s on one core, 150 times as long as for Fast-SNARF. With nine start bones (as in the released
 # code) and an eighth of the points it takes 0.4 s.
 _SNARF_LIGHT = (
     *_NETWORKS, "search=broyden", "training.poses_per_step=2", "training.uniform_points=150", "training.surface_points=450",
     "training.far_points=50", "training.validate_every=600",
 )  # fmt: skip
-_SNARF = Row("snarf", "SNARF", ("model=snarf", *_PAPERS), _SNARF_LIGHT, "snarf")
+_SNARF = Row("snarf", "SNARF", ("model=snarf", *_PAPERS), _SNARF_LIGHT, "snarf", cost=24.0)
 _SNARF_NOTE = (
     "With all presets except paper, SNARF searches from nine bones and uses an eighth of the points per step; the times of "
     "its rows are for these settings."
@@ -93,13 +97,14 @@ _SNARF_NOTE = (
 _SNARF_HOUR = Row(
     "snarf-hour", "SNARF, search from all bones", ("model=snarf", *_PAPERS),
     (*_NETWORKS, "search=snarf", "training.poses_per_step=4", "training.uniform_points=180", "training.surface_points=540",
-     "training.far_points=40"), "snarf", is_optional=True,
+     "training.far_points=40"), "snarf", cost=54.0, is_optional=True,
 )  # fmt: skip
 _SNARF_HOUR_NOTE = (
     "systems=[snarf-hour,...] has SNARF as near to its own settings as an hour of one core allows with training=quick: its "
     "search from all bones, with a sixth of its points per step, from half as many poses."
 )
-_FAST_SNARF = Row("fast_snarf-broyden", "Fast-SNARF", _BROYDEN, _NETWORKS, "fast_snarf")
+_NETWORKS_COST = 4.6  # of our kind of search with networks
+_FAST_SNARF = Row("fast_snarf-broyden", "Fast-SNARF", _BROYDEN, _NETWORKS, "fast_snarf", cost=_NETWORKS_COST)
 _GLOBAL = Row("ours-global", "ours, condition=global", (*_OURS, "condition=global"))
 _LOCAL = Row("ours-local", "ours, condition=local", (*_OURS, "condition=local"))
 _NONE = Row("ours-none", "ours, condition=none", (*_OURS, "condition=none"))
@@ -107,12 +112,13 @@ _NONE = Row("ours-none", "ours, condition=none", (*_OURS, "condition=none"))
 
 def _grid(key: str, resolution: tuple[int, int, int], paper: str) -> Row:
     sides = ",".join(map(str, resolution))
-    return Row(key, " x ".join(map(str, resolution)), (*_BROYDEN, f"skinning.resolution=[{sides}]"), _NETWORKS, paper)
+    overrides = (*_BROYDEN, f"skinning.resolution=[{sides}]")
+    return Row(key, " x ".join(map(str, resolution)), overrides, _NETWORKS, paper, cost=_NETWORKS_COST)
 
 
-def _changed(key: str, label: str, *overrides: str, inside_test: str = "winding") -> Row:
+def _changed(key: str, label: str, *overrides: str, inside_test: str = "winding", cost: float = 2.0) -> Row:
     """Return a row that differs from `_GLOBAL` in one setting."""
-    return Row(key, label, (*_OURS, "condition=global", *overrides), inside_test=inside_test)
+    return Row(key, label, (*_OURS, "condition=global", *overrides), inside_test=inside_test, cost=cost)
 
 
 _TABLE1 = Experiment(
@@ -138,10 +144,11 @@ _TABLE2 = Experiment(
     "Learning strategies and grids of the skinning weights (Fast-SNARF Table 2)",
     (
         _SNARF,
-        Row("fast_snarf-broyden", "Fast-SNARF, grid of the preset's network", _BROYDEN, _NETWORKS, "fast_snarf"),
+        Row("fast_snarf-broyden", "Fast-SNARF, grid of the preset's network", _BROYDEN, _NETWORKS, "fast_snarf",
+            cost=_NETWORKS_COST),
         Row("voxel", "w/o MLP distillation, 64 x 64 x 16",
             (*_BROYDEN, "skinning=voxel", "skinning.symmetric=false", "skinning.resolution=[64,64,16]"),
-            ("shape=small", "training.agreement_weight=0.0", "training.extend_weights_every=0"), "voxel"),
+            ("shape=small", "training.agreement_weight=0.0", "training.extend_weights_every=0"), "voxel", cost=_NETWORKS_COST),
         _grid("grid16", (16, 16, 4), "grid16"),
         _grid("grid32", (32, 32, 8), "grid32"),
         _grid("grid64", (64, 64, 16), "grid64"),
@@ -169,8 +176,8 @@ _ABLATIONS = Experiment(
         Row("broyden9_approximate", "search from 9 bones, Broyden's Jacobian", _BROYDEN),
         Row("broyden24", "search from all bones, exact Jacobian",
             ("model=fast_snarf", "search=broyden", "search.init_bones=null", "search.jacobian=exact", *_PAPERS)),
-        _changed("shape_network", "a network alone for the shape (shape=small)", "shape=small"),
-        _changed("weight_network", "a network for the skinning weights (skinning=coarse)", "skinning=coarse"),
+        _changed("shape_network", "a network alone for the shape (shape=small)", "shape=small", cost=4.0),
+        _changed("weight_network", "a network for the skinning weights (skinning=coarse)", "skinning=coarse", cost=4.0),
         _changed("oriented", "orientation-preserving roots only", "search.orientation_preserving=true"),
         _changed("no_agreement", "no loss for made-up poses", "training.agreement_weight=0.0"),
         _changed("all_cells", "every cell active", "skinning.bone_radius_m=null", "training.refresh_cells_every=0"),
@@ -180,7 +187,7 @@ _ABLATIONS = Experiment(
         _NONE,
         _changed("target_parent", "joint target: parent (F)", "training.joint_target=parent"),
         _changed("target_own", "joint target: own (released code)", "training.joint_target=own"),
-        Row("papers_recipe", "the papers' recipe in small networks", (*_BROYDEN, *_RECIPE), _NETWORKS),
+        Row("papers_recipe", "the papers' recipe in small networks", (*_BROYDEN, *_RECIPE), _NETWORKS, cost=_NETWORKS_COST),
     ),
     _BODIES,
     _BODY_SUBJECTS,
@@ -236,10 +243,10 @@ _STICK2D = Experiment(
     "stick2d",
     "2D stick (SNARF Sec. 4.3, Fig. 4 and 5)",
     (
-        Row("ours-none", "forward skinning (ours)", (*_OURS, "condition=none")),
-        Row("back_lbs", "Back-LBS", ("model=back_lbs", "condition=none")),
-        Row("pose_onet", "Pose-ONet", ("model=pose_onet", "condition=none")),
-        Row("piecewise", "Piecewise", ("model=piecewise", "condition=none")),
+        Row("ours-none", "forward skinning (ours)", (*_OURS, "condition=none"), cost=0.8),
+        Row("back_lbs", "Back-LBS", ("model=back_lbs", "condition=none"), cost=0.5),
+        Row("pose_onet", "Pose-ONet", ("model=pose_onet", "condition=none"), cost=0.2),
+        Row("piecewise", "Piecewise", ("model=piecewise", "condition=none"), cost=0.5),
     ),
     ("stick2d",),
     {"stick2d": ("stick", "stick_object", "stick_step10", "stick_step20", "stick_step30", "stick_step60")},
@@ -256,7 +263,7 @@ _CLOTHED = Experiment(
     "clothed",
     "Clothed humans (SNARF Sec. 4.5, Fast-SNARF Sec. 5.2)",
     tuple(
-        Row(row.key, row.label, (*_CLOTHED_SETTINGS, *row.overrides), row.light)
+        Row(row.key, row.label, (*_CLOTHED_SETTINGS, *row.overrides), row.light, cost=row.cost)
         for row in (Row("smpl_nn", "SMPL NN", ("model=smpl_nn", *_PAPERS)), _SNARF, _FAST_SNARF, _GLOBAL, _LOCAL)
     ),
     ("clothed", "cape"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -28,7 +29,9 @@ __all__ = [
     "STATUS",
     "JobStatus",
     "JobStopped",
+    "Runner",
     "is_evaluated",
+    "processor_s_of_children",
     "read_job_status",
     "read_status",
     "run_command",
@@ -69,6 +72,10 @@ class JobStatus:
     """Reason of a failure, one line."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Duration of each stage of the last call; stages with nothing to do are left out."""
+    spent_s: dict[str, float] = field(default_factory=dict)
+    """Duration of each stage in all calls together; a call that was killed is left out."""
+    processor_s: dict[str, float] = field(default_factory=dict)
+    """Processor time of the commands of each stage in all calls together; none where the system does not tell it."""
     tries: int = 1
     """How often the last call has tried it."""
     retry: str = ""
@@ -166,7 +173,10 @@ class _Stages:
         self.before = read_status(self.folder) or JobStatus("stopped")
         same = self.before.digest == job.digest
         trained = same and self.before.trained and self.avatar.is_file()
-        self.status = JobStatus("running", job.digest, trained, tries=tries, steps=self.before.steps if same else None)
+        self.status = JobStatus("running", job.digest, trained, tries=tries)
+        if same:
+            before = self.before
+            self.status = replace(self.status, steps=before.steps, spent_s=before.spent_s, processor_s=before.processor_s)
 
     def run(self) -> JobStatus:
         """Run the stages and return the final status."""
@@ -220,11 +230,13 @@ class _Stages:
         """Run one command and return whether it succeeded; otherwise `status` has the reason."""
         self._check()
         self._write(stage=name)
-        start, log = time.monotonic(), self.folder / LOG
+        log = self.folder / LOG
         begin = log.stat().st_size if log.exists() else 0
-        code = self.runner(self._with_threads(arguments), log, self.stopped)
-        spent = self.status.seconds.get(name, 0.0) + time.monotonic() - start
-        self._write(seconds={**self.status.seconds, name: round(spent, 2)})
+        start, processor_start = time.monotonic(), processor_s_of_children()
+        try:
+            code = self.runner(self._with_threads(arguments), log, self.stopped)
+        finally:
+            self._count(name, time.monotonic() - start, processor_s_of_children() - processor_start)
         if code == 0:
             return True
         self._check()
@@ -238,6 +250,14 @@ class _Stages:
         threads = self.threads() if arguments[0] in ("train", "eval") else None
         has_threads = any(argument.startswith("threads=") for argument in arguments)
         return arguments if threads is None or has_threads else (*arguments, f"threads={threads}")
+
+    def _count(self, name: str, spent_s: float, processor_s: float) -> None:
+        """Add to the times of a stage and record them."""
+        status = self.status
+        self._write(
+            seconds=_plus(status.seconds, name, spent_s), spent_s=_plus(status.spent_s, name, spent_s),
+            processor_s=_plus(status.processor_s, name, processor_s) if processor_s else status.processor_s,
+        )  # fmt: skip
 
     def _has_diverged(self) -> bool:
         try:
@@ -303,6 +323,17 @@ def _wait(process: subprocess.Popen[bytes], stopped: Callable[[], bool]) -> tupl
                 asked_s = time.monotonic()
             elif asked_s is not None and time.monotonic() - asked_s > _PATIENCE_S:
                 process.kill()
+
+
+def _plus(times: dict[str, float], name: str, seconds: float) -> dict[str, float]:
+    """Return times by stage, with more for one of them."""
+    return times | {name: round(times.get(name, 0.0) + seconds, 2)}
+
+
+def processor_s_of_children() -> float:
+    """Return the processor time of all commands that this process has waited for, of all their threads; 0 on Windows."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def _samples_exist(folder: str) -> bool:

@@ -171,10 +171,10 @@ class _Call:
             self.seen[number] = status
             if status.state != "running":
                 self.running.remove(number)
+            self.on_change(number, status)  # first, as it clears the terminal for a line
             if status.retry:
                 when = "when no other run works" if status.retry == ALONE else "when the other runs have ended"
                 log.info("%s: %s: %s; it is tried once more %s", self.jobs[number].name, status.stage, status.reason, when)
-            self.on_change(number, status)
 
 
 def _last_line(log_file: Path) -> str:

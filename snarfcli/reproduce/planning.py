@@ -26,6 +26,7 @@ __all__ = ["choose_experiments", "make_plan"]
 # The out-of-distribution poses of DFaust's subjects are another data set: PosePrior's motion on their bodies.
 _OTHER_OOD_DATA = {"dfaust": "poseprior"}
 _PARITY_FOLDER = "parity"
+_STEPS_OF_A_COST = 1200  # of training=quick, for which `Row.cost` is
 # For the curves of a training: its number of validations, and of frames out of distribution in each.
 _VALIDATIONS = 6
 _VALIDATION_OOD_FRAMES = 8
@@ -117,7 +118,8 @@ def make_plan(experiment: Experiment, options: ExperimentOptions, resolve: Resol
     )
     plain = resolve((f"data={data}", f"training={training}", *options.extra))  # without the settings of a row
     chosen = replace(experiment, rows=tuple(rows))
-    return Plan(chosen, data, tuple(subjects), options.seeds, training, options.extra, jobs, plain["training"])
+    options_of_all = (data, tuple(subjects), options.seeds, training, options.extra)
+    return Plan(chosen, *options_of_all, jobs, plain["training"], plain["data"])
 
 
 def _chosen_rows(experiment: Experiment, options: ExperimentOptions) -> list[Row]:
@@ -161,6 +163,9 @@ def _job(
         train=train,
         evaluations=_evaluation_stages(data, subject, folder, options, where, (*device, *given)),
         digest=_digest([resolved, seed, data, subject, row.inside_test, *budget]),
+        kind=_digest([resolved, data, row.inside_test, options.max_frames, options.surface_frames, *budget])[:16],
+        steps=resolved["training"]["steps"],
+        hint_s=60 * (row.minutes or row.cost * resolved["training"]["steps"] / _STEPS_OF_A_COST),
         minutes=row.minutes,
     )
 

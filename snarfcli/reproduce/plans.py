@@ -81,6 +81,12 @@ class Job:
     """Evaluations after the training."""
     digest: str
     """Hash of all settings that the avatar depends on."""
+    kind: str
+    """Hash of the settings without subject and seed: runs of one kind take about as long."""
+    steps: int
+    """Number of training steps."""
+    hint_s: float
+    """Rough processor time of its training in seconds, for estimates before anything is measured."""
     minutes: float | None = None
     """Budget of the training in minutes of one core, from which its number of steps follows; None: `train` has the number."""
 
@@ -110,6 +116,8 @@ class Plan:
     """Runs."""
     training_settings: dict[str, Any]
     """Settings of the preset after `extra`."""
+    data_settings: dict[str, Any]
+    """Settings of the data set."""
 
 
 def unique_jobs(plans: Sequence[Plan]) -> list[Job]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ from snarfcli.files import atomic_path, write_json
 from snarfcli.reproduce.figures import draw_figures
 from snarfcli.reproduce.papers import paper_source
 from snarfcli.reproduce.plans import Plan
-from snarfcli.reproduce.results import COLUMNS, Result, read_metrics
+from snarfcli.reproduce.provenance import provenance_lines, provenance_sections
+from snarfcli.reproduce.results import COLUMNS, NOT_RUN, Result, read_metrics
 from snarfcli.reproduce.tables import csv_table, markdown_runs, markdown_table, more_columns, order_lines
+from snarfcli.texts import counted
 
 __all__ = ["write_report"]
 
@@ -27,6 +30,7 @@ def write_report(
     *,
     about: str = "",
     figure_resolution: int | None = None,
+    is_growing: bool = False,
 ) -> list[Path]:
     """Write `<experiment>.md`, `<experiment>.csv`, `figures/` and `runs/` (the files behind the numbers) into a folder.
 
@@ -37,12 +41,14 @@ def write_report(
         command: the command line that made it.
         about: further facts about how it was run.
         figure_resolution: voxels along the longest side of drawn meshes; None draws no figures.
+        is_growing: whether runs are still going on, after which the report is written again. Files behind the numbers that it
+            has already are not copied again.
 
     Returns:
         The written tables and figures.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    copies = {id(result): _copy(result, folder) for result in results}
+    copies = {id(result): _copy(result, folder, keep=is_growing) for result in results}
 
     def link(result: Result, stage: str) -> str | None:
         return copies[id(result)].get(stage)
@@ -54,27 +60,31 @@ def write_report(
     figures = [] if figure_resolution is None else draw_figures(plan, results, folder / "figures", figure_resolution)
     text = folder / f"{name}.md"
     sections = [
-        _head(plan, results, command, about),
+        _head(plan, results, command, about, is_growing),
         _tables(plan, results, link),
         _figures_text(figures, folder),
         f"## Runs\n\nEvery number links to the file that it is from.\n\n{markdown_runs(plan, results, link)}",
+        *provenance_sections(results),
     ]
     with atomic_path(text) as temporary:
         temporary.write_text("\n\n".join(section for section in sections if section) + "\n")
     return [text, table, *(path for path, _ in figures)]
 
 
-def _head(plan: Plan, results: Sequence[Result], command: str, about: str) -> str:
-    """Return title, command, machine, settings and what the columns are."""
+def _head(plan: Plan, results: Sequence[Result], command: str, about: str, is_growing: bool) -> str:
+    """Return title, state, command, origin of the numbers, settings and what the columns are."""
     experiment = plan.experiment
     settings = ", ".join(f"{key} {_plain(value)}" for key, value in plan.training_settings.items() if key != "name")
     extra = f"; all with {', '.join(plan.extra)}" if plan.extra else ""
+    now = datetime.now(timezone.utc)
     lines = [
         f"# {experiment.title}",
         "",
+        *_unfinished(results, is_growing),
         f"    {command}",
         "",
-        f"- made by snarf {snarfcli.__version__} on {_machines(results)}{f', {about}' if about else ''}",
+        f"- made {now:%Y-%m-%d %H:%M} UTC by snarf {snarfcli.__version__}{f', {about}' if about else ''}",
+        *(f"- {line}" for line in provenance_lines(results)),
         f"- data {plan.data}, subjects {', '.join(plan.subjects)}, seeds {', '.join(map(str, plan.seeds))}",
         f"- training={plan.training}: {settings}{extra}; differences of single rows are in the `config.yaml` of their runs",
     ]
@@ -95,6 +105,15 @@ def _head(plan: Plan, results: Sequence[Result], command: str, about: str) -> st
     return "\n".join(lines)
 
 
+def _unfinished(results: Sequence[Result], is_growing: bool) -> list[str]:
+    """Return the paragraph that says how many runs are done; none if all are."""
+    done = sum(result.state == "done" for result in results)
+    if done == len(results):
+        return []
+    what = "this page is written again after every run" if is_growing else "the section Not done says why"
+    return [f"**Unfinished: {done} of {counted(len(results), 'run')} done**; {what}.", ""]
+
+
 def _tables(plan: Plan, results: Sequence[Result], link: Any) -> str:
     """Return the tables, the comparison with the order of the papers, and the list of unfinished runs."""
     sections = []
@@ -112,8 +131,10 @@ def _tables(plan: Plan, results: Sequence[Result], link: Any) -> str:
         sections.append(f"## Subject {subject}\n\n{markdown_table(plan, results, link, COLUMNS, subject)}")
     broken = [result for result in results if result.state != "done"]
     if broken:
-        listed = "\n".join(f"- {result.job.name}: {result.state}: {result.reason}" for result in broken)
-        sections.append(f"## Not done\n\n{listed}")
+        told = [f"- {result.job.name}: {result.state}: {result.reason}" for result in broken if result.reason != NOT_RUN]
+        others = len(broken) - len(told)
+        told += [f"- {counted(others, 'run')}{' more' if told else ''}: {NOT_RUN}"] if others else []
+        sections.append("## Not done\n\n" + "\n".join(told))
     return "\n\n".join(sections)
 
 
@@ -126,30 +147,26 @@ def _figures_text(figures: Sequence[tuple[Path, str]], folder: Path) -> str:
     return "\n\n".join(lines)
 
 
-def _copy(result: Result, folder: Path) -> dict[str, str]:
-    """Copy the files of a run into the report, without the numbers of single frames; return their relative paths."""
+def _copy(result: Result, folder: Path, keep: bool) -> dict[str, str]:
+    """Copy the files of a run into the report, without the numbers of single frames; return their relative paths.
+
+    With `keep`, a copy that is newer than its file stays.
+    """
     links = {}
     for stage, path in result.files.items():
         relative = Path("runs") / result.job.subject / Path(result.job.folder).name / _COPIES[stage]
+        links[stage] = relative.as_posix()
+        if keep and _is_newer(folder / relative, path):
+            continue
         metrics = read_metrics(path)
         for sequence in metrics.sequences.values():
             sequence.pop("per_frame", None)
         write_json(folder / relative, metrics.content | ({"sequences": metrics.sequences} if metrics.sequences else {}))
-        links[stage] = relative.as_posix()
     return links
 
 
-def _machines(results: Sequence[Result]) -> str:
-    """Return the machines of the runs, with the version of PyTorch."""
-    names = {}
-    for result in results:
-        if "train" in result.files:
-            metrics = read_metrics(result.files["train"])
-            machine, versions = metrics.machine, metrics.versions
-            parts = [machine.get("processor"), f"{machine.get('cores')} cores", f"{machine.get('threads')} threads per run"]
-            parts += [machine.get("gpu"), f"{machine.get('system')}, PyTorch {versions.get('torch')}"]
-            names[", ".join(str(part) for part in parts if part)] = None
-    return " and ".join(names) or "no machine yet"
+def _is_newer(path: Path, than: Path) -> bool:
+    return path.is_file() and path.stat().st_mtime > than.stat().st_mtime
 
 
 def _plain(value: Any) -> str:

@@ -15,7 +15,19 @@ from snarfcli.files import read_json
 from snarfcli.reproduce.jobs import JobStatus, is_evaluated, read_status
 from snarfcli.reproduce.plans import Job
 
-__all__ = ["COLUMNS", "MORE_COLUMNS", "Cell", "Column", "Metrics", "Result", "collect", "look_up", "read_metrics", "summarise"]
+__all__ = [
+    "COLUMNS",
+    "MORE_COLUMNS",
+    "NOT_RUN",
+    "Cell",
+    "Column",
+    "Metrics",
+    "Result",
+    "collect",
+    "look_up",
+    "read_metrics",
+    "summarise",
+]
 
 
 @dataclass(frozen=True)
@@ -37,6 +49,9 @@ class Column:
     digits: int = 1
     """Decimals in the table."""
 
+
+NOT_RUN = "not run yet"
+"""Reason of a run that has not begun."""
 
 _TIMES = "time for 200,000 points, milliseconds, scaled from smaller frames, on the machine named above"
 COLUMNS = (
@@ -91,6 +106,8 @@ class Metrics:
     """Versions of packages."""
     validations: list[dict[str, Any]] = field(default_factory=list)
     """Validations of a training, with the number of steps before each."""
+    code: dict[str, Any] = field(default_factory=dict)
+    """Version of the code; see `snarfcli.versions.recorded_code`."""
     content: dict[str, Any] = field(default_factory=dict)
     """The whole file."""
 
@@ -109,6 +126,12 @@ class Result:
     """Numbers by column key, in the units of the columns."""
     files: dict[str, Path] = field(default_factory=dict)
     """Files of the numbers, by stage: train, id, ood."""
+    origins: dict[str, Metrics] = field(default_factory=dict)
+    """Where these files come from, by stage: machine, versions and code."""
+    spent_s: float | None = None
+    """Duration of all its stages in all calls; None if it was not recorded."""
+    processor_s: float | None = None
+    """Processor time of all its commands; None if it was not recorded."""
 
     def unknown(self, column: Column) -> str | None:
         """Return why there is no number: failed, diverged, missing, or `none` if there is nothing to measure."""
@@ -153,7 +176,7 @@ def collect(job: Job) -> Result:
     folder = Path(job.folder)
     status = read_status(folder)
     if status is None:
-        return Result(job, "missing", "not run yet")
+        return Result(job, "missing", NOT_RUN)
     if status.digest != job.digest:
         return Result(job, "missing", f"{folder} has a run with other settings")
     values: dict[str, float] = {}
@@ -163,13 +186,15 @@ def collect(job: Job) -> Result:
     for evaluation in job.evaluations if "train" in files else ():
         if is_evaluated(evaluation, folder / "avatar.pt"):
             files[evaluation.split] = Path(evaluation.metrics)
-    contents = {stage: _known(path) for stage, path in files.items()}
+    known = {stage: _known(path) for stage, path in files.items()}
     for column in (*COLUMNS, *MORE_COLUMNS):
-        content = contents.get(column.stage)
+        content = known[column.stage].content if column.stage in known else None
         value = None if content is None else _training_min(content) if not column.path else look_up(content, column.path)
         if value is not None:
             values[column.key] = value * column.scale
-    return Result(job, *_state(status, job, files), values, files)
+    origins = {stage: replace(metrics, sequences={}, content={}) for stage, metrics in known.items()}
+    times = (sum(one.values()) if one else None for one in (status.spent_s, status.processor_s))
+    return Result(job, *_state(status, job, files), values, files, origins, *times)
 
 
 def summarise(results: Sequence[Result], column: Column) -> Cell:
@@ -219,12 +244,12 @@ def read_metrics(path: Path) -> Metrics:
     return replace(known, content=content)
 
 
-def _known(path: Path) -> dict[str, Any]:
+def _known(path: Path) -> Metrics:
     """Return the numbers of a run; none if its file is damaged, so that the table shows the others."""
     try:
-        return read_metrics(path).content
+        return read_metrics(path)
     except UserError:
-        return {}
+        return Metrics()
 
 
 def look_up(content: Any, path: Sequence[str]) -> float | None:

@@ -28,6 +28,7 @@ from snarfcli.samples.writing import (
     write_manifest,
 )
 from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, sample_frames
+from snarfcli.texts import counted
 from snarfcli.versions import recorded_versions
 
 __all__ = ["preprocess_subject"]
@@ -105,7 +106,7 @@ def preprocess_subject(
             done = complete_sequences(folder, subject, settings, frame_steps)
             missing = [spec for spec in chosen if (spec.split, spec.name) not in done]
             if len(missing) < len(chosen):
-                log.info("%d of %d sequences exist already", len(chosen) - len(missing), len(chosen))
+                log.info("%d of %s existed already", len(chosen) - len(missing), counted(len(chosen), "sequence"))
             made = _make_sequences(folder, subject, missing, sampling, settings, workers, broken if skip_broken else None)
             done.update({(entry["split"], entry["name"]): entry for entry in made})
             if not done:
@@ -263,8 +264,8 @@ def _make_sequences(
 def _report_sequence(entry: Mapping[str, Any]) -> None:
     open_mesh = f", open meshes (up to {entry['boundary_edges']} boundary edges)" if entry["boundary_edges"] else ""
     log.info(
-        "%s/%s: %d frames, %.2f %% of the points inside, %.3f %% self-intersecting%s",
-        entry["split"], entry["name"], entry["frames"],
+        "%s/%s: %s, %.2f %% of the points inside, %.3f %% self-intersecting%s",
+        entry["split"], entry["name"], counted(entry["frames"], "frame"),
         100 * entry["inside_share"], 100 * entry["self_intersecting_share"], open_mesh,
     )  # fmt: skip
     if entry["inside_share"] == 0:
@@ -278,8 +279,8 @@ def _report(manifest: Mapping[str, Any], frames: int, points_per_frame: int, sec
     all_frames = sum(counts.values())
     if frames:
         log.info(
-            "%d frames, %d samples in %.1f s: %.1f frames/s, %.0f samples/s",
-            frames, frames * points_per_frame, seconds, frames / seconds, frames * points_per_frame / seconds,
+            "%s, %d samples in %.1f s: %.1f frames/s, %.0f samples/s",
+            counted(frames, "frame"), frames * points_per_frame, seconds, frames / seconds, frames * points_per_frame / seconds,
         )  # fmt: skip
     log.info(
         "subject %s of %s data: %d train, %d test, %d ood frames, %.1f MB on disk, %.0f bytes per frame",

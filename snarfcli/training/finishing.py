@@ -17,6 +17,7 @@ from snarfcli.models.system import Found
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.samples.store import SampleStore
+from snarfcli.texts import counted
 from snarfcli.training.batches import FrameBatches, load_frames
 
 __all__ = ["averaged", "drop_needless", "validate"]
@@ -48,11 +49,10 @@ def drop_needless(avatar: TrainedField, batches: FrameBatches, precision: str) -
         inside = (_found_inside(avatar, batches, step) for step in range(_STEPS_OF_SUPPORT))
         dropped = avatar.model.drop_pieces(poses, inside)
     if dropped:
-        what = "a piece" if dropped == 1 else f"{dropped} pieces"
         wanted = avatar.config.model.components
         why = "no point inside a training mesh needs it; model.components=N keeps the N largest" if wanted is None else ""
         why = why or f"model.components={wanted}"
-        log.info("dropped %s of the shape beside the body (%s)", what, why)
+        log.info("dropped %s of the shape beside the body (%s)", counted(dropped, "piece"), why)
     avatar.model.freeze()
 
 

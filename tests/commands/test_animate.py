@@ -194,7 +194,7 @@ def test_what_is_missing_beside_is_no_missing_frame(config, toy, monkeypatch, ca
     assert record["skipped"] == []
     assert [frame["file"] for frame in record["frames"]] == ["frame_000000.ply", "frame_000001.ply"]
     assert [entry["reason"] for entry in record["missing"]] == ["skinned surface: nothing there"] * 2
-    assert "2 of 2 frames lack a panel beside the avatar" in caplog.text
+    assert "2 of 2 frames without a panel beside the avatar" in caplog.text
 
 
 def test_truth_is_shown_where_there_is_some(config, toy, tmp_path, monkeypatch):

@@ -70,7 +70,7 @@ def test_samples_do_not_depend_on_workers_or_interruptions(
     assert [entry["name"] for entry in json.loads(_contents(two)["manifest.json"])["sequences"]] == ["fold"]
     caplog.clear()
     preprocess.run(_config(two, workers=0))
-    assert "1 of 3 sequences exist already" in caplog.text
+    assert "1 of 3 sequences existed already" in caplog.text
     assert _contents(one) == _contents(two)
 
     store = SampleStore.open(one, "builtin", "toy")

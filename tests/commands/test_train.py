@@ -73,7 +73,7 @@ def test_the_run_folder_holds_all_that_a_run_should(config, caplog):
     assert {"versions", "machine"} <= set(metrics)
     assert "steps: 6" in (folder / "config.yaml").read_text()
     assert Avatar.load(folder / "avatar.pt").facts["steps"] == 6
-    assert "data: builtin, subject toy, 1 sequences, 11 frames to train on" in caplog.text
+    assert "data: builtin, subject toy, 1 sequence, 11 frames to train on" in caplog.text
     assert "points/s" in caplog.text
     assert "validation (held-back motion): IoU bbox" in caplog.text
 

@@ -262,7 +262,7 @@ def test_deep_nesting_is_no_recursion(tmp_path):
         ("HIERARCHY\nROOT a {\nROOT b {", "line 3: a ROOT must stand outside"),
         ("HIERARCHY\nROOT a {\nEnd Site {\nJOINT b {", "line 4: an End Site cannot contain joints"),
         ("HIERARCHY\nROOT a {\nOFSET 0 0 0 }", "line 3: wanted OFFSET, CHANNELS, JOINT, End Site or a brace, got 'OFSET'"),
-        ("HIERARCHY\nROOT a {\nOFFSET 0 0 0\nMOTION\n", "line 4: the braces of 1 joints are not closed"),
+        ("HIERARCHY\nROOT a {\nOFFSET 0 0 0\nMOTION\n", "line 4: the braces of 1 joint are not closed"),
         ("HIERARCHY\nROOT a { }\n}\nMOTION\n", "line 3: wanted ROOT or MOTION, got '}'"),
         ("HIERARCHY\n" + "ROOT a { }\n" * 5001, "line 5002: there are more than 5000 joints"),
         (ARM + "0 90 1.5 10 20 30 -40 50 60 70 6 7\n", "line 29: frame 0: wanted 11 values, one per channel, got 12"),

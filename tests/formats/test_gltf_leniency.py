@@ -86,7 +86,7 @@ def test_one_damaged_clip_leaves_the_others(tmp_path, caplog, values, path, reas
     same(rig, read(tmp_path, with_clips()))
     assert [name for name, _ in rig.left_out] == ["bad"]
     assert reason in rig.left_out[0][1]
-    assert "1 motions cannot be used and were left out ('bad': " in caplog.text
+    assert "left out 1 motion that cannot be used ('bad': " in caplog.text
     alone = with_clips(("bad", values, path))
     alone.root["animations"].pop()
     with pytest.raises(UserError, match=reason):

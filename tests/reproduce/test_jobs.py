@@ -14,6 +14,7 @@ import pytest
 from fake_runs import fake_metrics, fake_plan, fake_samples
 
 from snarfcli.files import write_json
+from snarfcli.reproduce import jobs
 from snarfcli.reproduce.jobs import LOG, STATUS, JobStopped, read_status, run_command, run_job
 from snarfcli.reproduce.results import collect
 
@@ -87,6 +88,36 @@ def test_an_interrupted_run_goes_on_at_the_stage_where_it_stopped(job):
         run_job(job, runner=player)
         assert player.calls == left
     assert collect(job).state == "done"
+
+
+def test_times_of_all_calls_are_added(job, monkeypatch):
+    """By clocks that every command moves: by 10 s, in which two threads compute for 15 s."""
+    clock = {"wall": 0.0, "processor": 0.0}
+    monkeypatch.setattr(jobs.time, "monotonic", lambda: clock["wall"])
+    monkeypatch.setattr(jobs, "processor_s_of_children", lambda: clock["processor"])
+
+    class Slow(Player):
+        def __call__(self, arguments, log, stopped):
+            clock["wall"] += 10.0
+            clock["processor"] += 15.0
+            return super().__call__(arguments, log, stopped)
+
+    run_job(job, runner=Slow(job, train=130))
+    status = run_job(job, runner=Slow(job))
+    assert status.seconds == {"train": 10.0, "id": 10.0, "ood": 10.0}
+    assert status.spent_s == {"train": 20.0, "id": 10.0, "ood": 10.0}
+    assert status.processor_s == {"train": 30.0, "id": 15.0, "ood": 15.0}
+    again = run_job(job, runner=Slow(job))
+    assert (again.seconds, again.spent_s) == ({}, status.spent_s), "kept when there is nothing to do"
+    other = type(job)(**{**vars(job), "digest": "another"})
+    assert run_job(other, runner=Slow(other)).spent_s["train"] == 10.0, "another run in the same folder"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the system tells the processor time of children on Unix alone")
+def test_the_processor_time_of_a_command_is_known(tmp_path):
+    before = jobs.processor_s_of_children()
+    run_command(["--version"], tmp_path / LOG, lambda: False)
+    assert jobs.processor_s_of_children() > before
 
 
 def test_a_stopped_plan_begins_nothing(job):

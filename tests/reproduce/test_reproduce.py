@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import logging
+import re
 from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from fake_runs import fake_run
 from omegaconf import OmegaConf
 from toy_training import toy_store
 
@@ -17,7 +19,7 @@ from snarfcli.commands import reproduce
 from snarfcli.commands.reproduce import ReproduceConfig, run
 from snarfcli.hydra_config.overrides import quote_items
 from snarfcli.hydra_config.schema import config_folder
-from snarfcli.reproduce.jobs import JobStopped, run_job
+from snarfcli.reproduce.jobs import JobStatus, JobStopped, run_job
 
 
 @pytest.fixture
@@ -64,7 +66,7 @@ def test_a_user_error_is_one_line_with_code_2(capsys, elsewhere, arguments):
 def test_a_dry_run_prints_commands_and_does_nothing(capsys, caplog, elsewhere):
     caplog.set_level(logging.INFO, "snarfcli")
     extra = "extra=[training.steps=9,skinning.resolution=[8,8,4]]"
-    code, _, err = call(capsys, "table1", "--dry-run", "subjects=[50002]", "systems=[nasa]", extra)
+    code, _, err = call(capsys, "table1", "--dry-run", "measure=false", "subjects=[50002]", "systems=[nasa]", extra)
     assert code == 0, err
     assert "run 1 of 1: nasa: NASA, subject 50002, seed 0, outputs/builtin/50002/nasa-quick-s0-" in caplog.text
     assert "snarf preprocess subject='50002' data=builtin" in caplog.text
@@ -72,6 +74,8 @@ def test_a_dry_run_prints_commands_and_does_nothing(capsys, caplog, elsewhere):
         "model=nasa condition=global shape=small skinning=coarse training.agreement_weight=0.0 "
         "training.steps=9 skinning.resolution=[8,8,4] seed=0" in caplog.text
     )
+    assert "1 run to run: about " in caplog.text
+    assert "not measured, rough" in caplog.text
     assert not list(elsewhere.iterdir())
 
 
@@ -119,7 +123,9 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
     })  # fmt: skip
     calls = []
 
-    def launch(jobs, folder, launcher, on_change):
+    grown = []
+
+    def launch(jobs, folder, launcher, on_change, on_look):
         for number, job in enumerate(jobs):
 
             def runner(arguments, log, stopped, job=job):
@@ -129,11 +135,18 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
                     return 2
                 return in_this_process(arguments, log, stopped)
 
+            on_change(number, JobStatus("running"))
+            on_look()
             on_change(number, run_job(job, runner=runner))
+            grown.append((tmp_path / "outputs/reproduce/table1/table1.md").read_text())
 
     monkeypatch.setattr(reproduce, "launch", launch)
     assert run(config) == 1, "one failed"
     assert [call for call in calls if call[0] == "ours-local"] == [("ours-local", name) for name in ("train", "eval", "eval")]
+    assert [text.count("not run yet") for text in grown] == [1, 1, 0]
+    assert [re.findall(r"\*\*Unfinished: (.*)\*\*; this", text) for text in grown] == [
+        ["1 of 3 runs done"], ["1 of 3 runs done"], ["2 of 3 runs done"],
+    ]  # fmt: skip
     folder = tmp_path / "outputs/reproduce/table1"
     text = (folder / "table1.md").read_text()
     assert "| Back-D | failed | failed |" in text
@@ -147,7 +160,10 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
     assert (folder / of_runs["ours-local"]["ood_file"]).is_file()
     drawn = {path.name for path in (folder / "figures").iterdir()}
     assert drawn == {"systems.png", "weights.png", "training.png", "frames.png"}, "one sequence has no curve"
-    assert "1 of 3: Back-D, subject toy, seed 0: failed (train: no such luck)" in caplog.text
+    assert "**Unfinished: 2 of 3 runs done**; the section Not done says why." in text
+    assert "2 of 3: Back-D, subject toy, seed 0: failed (train: no such luck)" in caplog.text
+    known = (tmp_path / "outputs/reproduce/durations.json").read_text()
+    assert known.count('"row": "ours-local"') == 1
     assert "IoU in/out of distribution" in caplog.text
 
     calls.clear()
@@ -158,3 +174,30 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
     assert run(again) == 1
     assert calls == []
     assert "| NASA | missing | missing |" in (folder / "table1.md").read_text()
+
+
+def test_ctrl_c_leaves_a_table_of_the_runs_so_far(tmp_path, monkeypatch, caplog):
+    toy_store(tmp_path / "data", points=400, frames=8)
+    caplog.set_level(logging.INFO, "snarfcli")
+    defaults = OmegaConf.to_container(OmegaConf.load(config_folder() / "reproduce" / "reproduce.yaml"))
+    defaults.pop("defaults")
+    config = ReproduceConfig(**defaults | {
+        "what": "table1", "subjects": ["toy"], "systems": ["back_d", "nasa"], "data_root": str(tmp_path / "data"),
+        "output_root": str(tmp_path / "outputs"),
+    })  # fmt: skip
+
+    def launch(jobs, folder, launcher, on_change, on_look):
+        for number, job in enumerate(jobs):
+            on_change(number, JobStatus("running"))
+            fake_run(job, {"id": 0.9, "ood": 0.8}, "stopped" if number else "done", trained=not number)
+        on_change(0, JobStatus("done", seconds={"train": 1.0}))
+        on_change(1, JobStatus("stopped"))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reproduce, "launch", launch)
+    with pytest.raises(KeyboardInterrupt):
+        run(config)
+    assert "stopped with 1 of 2 runs done; run the same command to continue" in caplog.text
+    text = (tmp_path / "outputs/reproduce/table1/table1.md").read_text()
+    assert "**Unfinished: 1 of 2 runs done**" in text
+    assert "- Back-D, subject toy, seed 0: stopped: interrupted at train" in text, "not as if it still ran"

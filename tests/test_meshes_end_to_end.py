@@ -43,4 +43,4 @@ def test_the_next_step_is_named(folders, tmp_path, capsys):
     assert main(["animate", *folders, output]) == 2
     assert 'run "snarf train data=meshes subject=rex' in capsys.readouterr().err
     assert main(["doctor", "data.folder=x"]) == 2
-    assert "data.folder: wanted a choice of data too" in capsys.readouterr().err
+    assert "data.folder: wanted a choice of data too; add one of data=amass, data=builtin" in capsys.readouterr().err

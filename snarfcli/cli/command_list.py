@@ -94,7 +94,7 @@ COMMAND_LIST = (
         "reproduce",
         "reproduce",
         "ReproduceConfig",
-        "make the papers' tables and figures: table1, table2, ablations, stick2d, clothed or all",
+        "make the papers' tables and figures: table1, table2, ablations, minutes, stick2d, clothed or all",
         "snarf reproduce table1 subjects=[50002,50004] training=quick",
         {"--dry-run": "dry_run=true"},
         positional="what",

@@ -16,6 +16,7 @@ from omegaconf import MISSING
 from snarfcli.avatar import Avatar
 from snarfcli.checks import check_choice, check_number
 from snarfcli.commands.deformer_checks import check_search
+from snarfcli.commands.search_names import search_name
 from snarfcli.datasets.builtin import builtin_subject
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import SearchConfig
@@ -119,8 +120,8 @@ def run(config: EvalConfig) -> None:
         store.data, store.subject, SPLITS[config.split], counted(len(sequences), "sequence"),
         counted(sum(s.num_frames for s in sequences), "frame"),
     )  # fmt: skip
-    search = avatar.model.search
-    log.info("avatar: %s, %s, on %s", path, f"search {search.name}" if search else avatar.config.model.name, device)
+    search = search_name(config.search) if config.search else avatar.model.search and avatar.model.search.name
+    log.info("avatar: %s, %s, on %s", path, f"search {search}" if search else avatar.config.model.name, device)
 
     with hold_output(folder, "snarf eval", wait=config.wait):
         remove_temporaries(folder)
@@ -256,7 +257,7 @@ def _folder_name(config: EvalConfig, avatar: Avatar) -> str:
     if config.refine_poses:
         parts.append("refined")
     if config.search is not None:
-        parts.append(config.search.name)
+        parts.append(search_name(config.search))
     if avatar.facts.get("data", config.data.name) != config.data.name:
         parts.append(config.data.name)
     if avatar.facts.get("subject", config.subject) != config.subject:

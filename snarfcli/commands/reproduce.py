@@ -56,7 +56,7 @@ class ReproduceConfig:
     """Settings of `snarf reproduce`."""
 
     what: str | None = MISSING
-    """table1, table2, ablations, stick2d, clothed or all; can be given as first argument without its name."""
+    """table1, table2, ablations, minutes, stick2d, clothed or all; can be given as first argument without its name."""
     subjects: list[str] = MISSING
     """Subjects; empty for 50002 and 50004 (built-in), or all ten (DFaust)."""
     seeds: list[int] = MISSING

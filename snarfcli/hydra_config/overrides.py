@@ -55,7 +55,8 @@ def check_overrides(overrides: Sequence[str], schema: type, command: str = "") -
             raise UserError(f"unknown setting '{key}'{nearest(key, names)}; \"--help\" lists all settings")
         group = key.split(".")[0]
         if group != key and group in optional and not any(other.startswith(f"{group}=") for other in overrides):
-            raise UserError(f"{key}: wanted a choice of {group} too; add one, such as {group}={group_options(group)[0]}")
+            known = ", ".join(f"{group}={option}" for option in group_options(group))
+            raise UserError(f"{key}: wanted a choice of {group} too; add one of {known} (a run has its own in config.yaml)")
         if key in groups:
             _check_options(override, group_options(groups[key]), is_optional=key in optional)
 

@@ -19,7 +19,7 @@ __all__ = ["measure_missing", "print_commands", "print_durations"]
 
 log = logging.getLogger(__name__)
 
-_SOURCES = {"runs": "finished runs", "steps": "measured steps", "hint": "not measured, rough"}
+_SOURCES = {"runs": "finished runs", "steps": "measured steps", "budget": "its minutes", "hint": "not measured, rough"}
 
 
 def print_commands(jobs: Sequence[Job]) -> None:
@@ -31,6 +31,10 @@ def print_commands(jobs: Sequence[Job]) -> None:
             if samples.folder not in made and not (Path(samples.folder) / "manifest.json").exists():
                 log.info("  snarf %s", " ".join(samples.arguments))
             made.add(samples.folder)
+        if job.minutes is not None:
+            log.info(
+                "  with as many training.steps as fit into %g minutes of one core, by a short training before", job.minutes
+            )
         for arguments in (job.train, *(evaluation.arguments for evaluation in job.evaluations)):
             log.info("  snarf %s", " ".join(arguments))
 

@@ -70,7 +70,7 @@ class Estimate:
     processor_s: float
     """Processor time of both."""
     source: str
-    """runs (finished runs of the kind), steps (measured steps) or hint."""
+    """runs (finished runs of the kind), steps (measured steps), budget (the minutes of the row) or hint."""
 
     @property
     def total_s(self) -> float:
@@ -128,8 +128,8 @@ class Durations:
                 )
                 processor_s = statistics.median(one.train_processor_s + one.evaluations_processor_s for one in usable)
                 return Estimate(train_s, evaluations_s, processor_s, source)
-        train_s = job.hint_s * self._scale()
-        return Estimate(train_s, _EVALUATIONS_HINT_S, train_s + _EVALUATIONS_HINT_S, "hint")
+        source, train_s = ("hint", job.hint_s * self._scale()) if job.minutes is None else ("budget", 60 * job.minutes)
+        return Estimate(train_s, _EVALUATIONS_HINT_S, train_s + _EVALUATIONS_HINT_S, source)
 
     def note_run(self, job: Job) -> None:
         """Remember a run that has just finished, and write the file."""
@@ -183,16 +183,21 @@ def finished_duration(job: Job) -> Duration | None:
     if not isinstance(machine, dict) or step_s is None or steps is None:
         return None
     spent, processor = status.spent_s, status.processor_s
-    train_s = max(spent.get("train", 0.0), step_s * steps)
+    train_s = max(_of_training(spent), step_s * steps)
     evaluated = [one for one in job.evaluations if Path(one.metrics).is_file()]
     evaluations = {one.split: spent.get(one.split) or _wall_s(Path(one.metrics)) for one in evaluated}
     threads, gpu = machine.get("threads"), machine.get("gpu")
     return Duration(
         train_s, round(sum(evaluations.values()), 2),
-        max(processor.get("train", 0.0), look_up(trained, ("timings", "processor_s")) or 0.0) or train_s,
+        max(_of_training(processor), look_up(trained, ("timings", "processor_s")) or 0.0) or train_s,
         sum(processor.get(split) or seconds for split, seconds in evaluations.items()),
         threads if type(threads) is int else 1, machine_name(machine), gpu if isinstance(gpu, str) else "",
     )  # fmt: skip
+
+
+def _of_training(times: dict[str, float]) -> float:
+    """Return the time of a training and, with a budget of minutes, of the short one before it."""
+    return times.get("train", 0.0) + times.get("speed", 0.0)
 
 
 def machine_name(machine: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ from snarfcli.locks import inherited_locks, locked
 from snarfcli.output_locks import clear_killed
 from snarfcli.reproduce.failures import AGAIN, ALONE, reason_of, retry_of
 from snarfcli.reproduce.plans import EvaluationStage, Job
+from snarfcli.reproduce.speed import clear_speed, measured_steps, speed_arguments, timed_arguments
 from snarfcli.safe_start import safe_environment, snarf_command
 from snarfcli.samples.layout import samples_folder
 from snarfcli.texts import one_line
@@ -66,7 +67,7 @@ class JobStatus:
     trained: bool = False
     """Whether the avatar exists."""
     stage: str = ""
-    """samples, train, id or ood: the stage that is running or has failed."""
+    """samples, speed, train, id or ood: the stage that is running or has failed."""
     reason: str = ""
     """Reason of a failure, one line."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -79,6 +80,8 @@ class JobStatus:
     """How often the last call has tried it."""
     retry: str = ""
     """Whether it may help to try a failed run once more: `failures.AGAIN` or `failures.ALONE`; empty if not."""
+    steps: int | None = None
+    """Number of training steps that fit into the minutes of the job, as it was measured; None if the job has no such budget."""
 
 
 Runner = Callable[[Sequence[str], Path, Callable[[], bool]], int]
@@ -172,7 +175,8 @@ class _Stages:
         trained = same and self.before.trained and self.avatar.is_file()
         self.status = JobStatus("running", job.digest, trained, tries=tries)
         if same:
-            self.status = replace(self.status, spent_s=self.before.spent_s, processor_s=self.before.processor_s)
+            before = self.before
+            self.status = replace(self.status, steps=before.steps, spent_s=before.spent_s, processor_s=before.processor_s)
 
     def run(self) -> JobStatus:
         """Run the stages and return the final status."""
@@ -185,7 +189,8 @@ class _Stages:
             if not _samples_exist(samples.folder) and not self._stage("samples", samples.arguments):
                 return self.status
         if not (self.status.trained and (self.folder / "metrics.json").is_file()):
-            if not self._stage("train", self.job.train):
+            arguments = self._train_arguments()
+            if arguments is None or not self._stage("train", arguments):
                 return self.status
             self._write(trained=True)
         for evaluation in self.job.evaluations:
@@ -199,6 +204,27 @@ class _Stages:
     def _check(self) -> None:
         if self.stopped():
             raise JobStopped
+
+    def _train_arguments(self) -> Sequence[str] | None:
+        """Return the arguments of the training; None if its number of steps could not be measured, and `status` has the reason.
+
+        A number that was measured before is kept, since a training can only be continued with the same one.
+        """
+        if self.job.minutes is None:
+            return self.job.train
+        if self.status.steps is None:
+            clear_speed(self.job)
+            try:
+                if not self._stage("speed", speed_arguments(self.job)):
+                    return None
+                self._write(steps=measured_steps(self.job))
+            except UserError as error:
+                self.status = replace(self.status, state="failed", reason=str(error))
+                return None
+            finally:
+                clear_speed(self.job)
+        assert self.status.steps is not None
+        return timed_arguments(self.job, self.status.steps)
 
     def _stage(self, name: str, arguments: Sequence[str]) -> bool:
         """Run one command and return whether it succeeded; otherwise `status` has the reason."""

@@ -100,33 +100,36 @@ def make_plan(experiment: Experiment, options: ExperimentOptions, resolve: Resol
     rows = _chosen_rows(experiment, options)
     if len(set(options.seeds)) != len(options.seeds) or not options.seeds or min(options.seeds) < 0:
         raise UserError(f"seeds: wanted different whole numbers from 0, at least one, got {list(options.seeds)}")
-    _check_extra(options.extra)
-    common = (f"data={data}", f"training={training}")
+    _check_extra(options.extra, rows)
     resolved = {}
     for row in rows:
+        preset = row.training or training
         try:
-            resolved[row.key] = resolve((*common, *row.settings(training), *options.extra))
+            resolved[row.key] = resolve((f"data={data}", f"training={preset}", *row.settings(preset), *options.extra))
         except UserError as error:
             raise UserError(f"row {row.key}: {error}") from None
     subjects = options.subjects or experiment.subjects.get(data, ())
     _check_subjects(experiment, data, subjects, options, resolved[rows[0].key]["data"])
     jobs = tuple(
-        _job(row, data, subject, seed, training, options, resolved[row.key])
+        _job(row, data, subject, seed, row.training or training, options, resolved[row.key])
         for seed in options.seeds
         for subject in subjects
         for row in rows
     )
-    preset = resolve((*common, *options.extra))  # without the settings of a row
+    plain = resolve((f"data={data}", f"training={training}", *options.extra))  # without the settings of a row
     chosen = replace(experiment, rows=tuple(rows))
-    return Plan(chosen, data, tuple(subjects), options.seeds, training, options.extra, jobs, preset["training"], preset["data"])
+    options_of_all = (data, tuple(subjects), options.seeds, training, options.extra)
+    return Plan(chosen, *options_of_all, jobs, plain["training"], plain["data"])
 
 
 def _chosen_rows(experiment: Experiment, options: ExperimentOptions) -> list[Row]:
-    """Return the rows that `systems=` names, or all rows."""
+    """Return the rows that `systems=` names, or all that are not optional."""
     unknown = [key for key in options.systems if key not in [row.key for row in experiment.rows]]
     if unknown:
         raise UserError(_unknown_systems(unknown, experiment.rows))
-    return [row for row in experiment.rows if not options.systems or row.key in options.systems]
+    if options.systems:
+        return [row for row in experiment.rows if row.key in options.systems]
+    return [row for row in experiment.rows if not row.is_optional]
 
 
 def _job(
@@ -138,14 +141,17 @@ def _job(
     folder = run_folder(options.output_root, data, subject, name)
     root = options.data_root
     train_root = root if row.inside_test == "winding" else str(Path(root) / _PARITY_FOLDER)
-    machine = (f"device={options.device}", *((f"threads={options.threads}",) if options.threads else ()))
+    device, given = (f"device={options.device}",), (f"threads={options.threads}",) if options.threads else ()
     where = (_text("output_root", options.output_root), f"run={name}")
     settings = (*row.settings(training), *options.extra)
+    steps = resolved["training"]["steps"] if row.minutes is None else None  # they are measured
+    threads = given if row.minutes is None else ("threads=1",)  # so that other work on the machine hardly changes the result
     train = (
         "train", f"subject={quote(subject)}", f"data={data}", f"training={training}",
-        *_curve_settings(data, resolved["training"]["steps"], settings), *settings,
-        f"seed={seed}", _text("data_root", train_root), *where, *machine, "resume=true",
+        *_curve_settings(data, steps, settings), *settings,
+        f"seed={seed}", _text("data_root", train_root), *where, *device, *threads, "resume=true",
     )  # fmt: skip
+    budget = [] if row.minutes is None else [row.minutes]
     return Job(
         row=row.key,
         label=row.label,
@@ -155,17 +161,18 @@ def _job(
         folder=str(folder),
         samples=_samples_stages(data, subject, root, train_root, row.inside_test),
         train=train,
-        evaluations=_evaluation_stages(data, subject, folder, options, where, machine),
-        digest=_digest([resolved, seed, data, subject, row.inside_test]),
-        kind=_digest([resolved, data, row.inside_test, options.max_frames, options.surface_frames])[:16],
+        evaluations=_evaluation_stages(data, subject, folder, options, where, (*device, *given)),
+        digest=_digest([resolved, seed, data, subject, row.inside_test, *budget]),
+        kind=_digest([resolved, data, row.inside_test, options.max_frames, options.surface_frames, *budget])[:16],
         steps=resolved["training"]["steps"],
-        hint_s=60 * row.cost * resolved["training"]["steps"] / _STEPS_OF_A_COST,
+        hint_s=60 * (row.minutes or row.cost * resolved["training"]["steps"] / _STEPS_OF_A_COST),
+        minutes=row.minutes,
     )
 
 
-def _curve_settings(data: str, steps: int, settings: Sequence[str]) -> tuple[str, ...]:
+def _curve_settings(data: str, steps: int | None, settings: Sequence[str]) -> tuple[str, ...]:
     """Return settings with which a training measures its IoU now and then, in and out of distribution; given ones stay."""
-    curve = {"training.validate_every": max(1, steps // _VALIDATIONS)}
+    curve = {} if steps is None else {"training.validate_every": max(1, steps // _VALIDATIONS)}
     if data not in _OTHER_OOD_DATA:
         curve["training.validation_ood_frames"] = _VALIDATION_OOD_FRAMES
     given = {setting.partition("=")[0] for setting in settings}
@@ -209,12 +216,17 @@ def _evaluation_stages(
     return tuple(stages)
 
 
-def _check_extra(extra: Sequence[str]) -> None:
+def _check_extra(extra: Sequence[str], rows: Sequence[Row]) -> None:
     """Check that the further settings are not among those that the plan sets itself."""
+    timed = [row.key for row in rows if row.minutes is not None]
     for override in extra:
         name = override.partition("=")[0].lstrip("+")
         if name in _OWN_SETTINGS:
             raise UserError(f"extra: {name} is set by reproduce itself; give {_OWN_SETTINGS[name]}")
+        if timed and name == "training.steps":
+            raise UserError(
+                f"extra: {name} follows from the minutes of row {timed[0]}; leave it out, or choose other systems=[...]"
+            )
 
 
 def _check_subjects(

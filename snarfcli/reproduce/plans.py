@@ -87,6 +87,8 @@ class Job:
     """Number of training steps."""
     hint_s: float
     """Rough processor time of its training in seconds, for estimates before anything is measured."""
+    minutes: float | None = None
+    """Budget of the training in minutes of one core, from which its number of steps follows; None: `train` has the number."""
 
     @property
     def name(self) -> str:

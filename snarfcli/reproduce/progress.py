@@ -26,7 +26,7 @@ _COMMAND = re.compile(r"\$ snarf (\w+)\b(?:.*\bsplit=(\w+))?.*")
 _STEPS = re.compile(r"(?:resuming at )?step (\d{1,9}) of (\d{1,9})\b.*")
 _ITEMS = re.compile(r".*: (\d{1,9}) of (\d{1,9}) (\w+), [\d.]+ \w+/s")
 _STAGES = {"preprocess": "samples", "train": "train"}
-_TITLES = {"samples": "samples", "train": "train", "id": "eval in", "ood": "eval out"}
+_TITLES = {"samples": "samples", "speed": "speed", "train": "train", "id": "eval in", "ood": "eval out"}
 _NAME_WIDTH = 30
 
 

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from datetime import datetime, timezone
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import snarfcli
-from snarfcli.errors import UserError
 from snarfcli.files import atomic_path, write_json
-from snarfcli.reproduce import figures
+from snarfcli.reproduce.figures import draw_figures
 from snarfcli.reproduce.papers import paper_source
 from snarfcli.reproduce.plans import Plan
 from snarfcli.reproduce.provenance import provenance_lines, provenance_sections
@@ -22,10 +19,7 @@ from snarfcli.texts import counted
 
 __all__ = ["write_report"]
 
-log = logging.getLogger(__name__)
-
 _COPIES = {"train": "train.json", "id": "eval_id.json", "ood": "eval_ood.json"}
-_DRAWN = {"table1": ("systems", "weights"), "table2": ("weights",), "ablations": (), "clothed": ("systems",)}
 
 
 def write_report(
@@ -63,7 +57,7 @@ def write_report(
     table = folder / f"{name}.csv"
     with atomic_path(table) as temporary:
         temporary.write_text(csv_table(plan, results, link))
-    figures = [] if figure_resolution is None else _figures(plan, results, folder / "figures", figure_resolution)
+    figures = [] if figure_resolution is None else draw_figures(plan, results, folder / "figures", figure_resolution)
     text = folder / f"{name}.md"
     sections = [
         _head(plan, results, command, about, is_growing),
@@ -142,29 +136,6 @@ def _tables(plan: Plan, results: Sequence[Result], link: Any) -> str:
         told += [f"- {counted(others, 'run')}{' more' if told else ''}: {NOT_RUN}"] if others else []
         sections.append("## Not done\n\n" + "\n".join(told))
     return "\n\n".join(sections)
-
-
-def _figures(plan: Plan, results: Sequence[Result], folder: Path, resolution: int) -> list[tuple[Path, str]]:
-    """Draw the figures of the experiment; a figure that cannot be drawn is left out with a warning."""
-    if plan.experiment.name == "stick2d":
-        wanted = [
-            ("shapes", partial(figures.draw_stick_shapes, plan, results, folder)),
-            ("curves", partial(figures.draw_stick_curves, plan, results, folder)),
-        ]
-    else:
-        draw = {"systems": figures.draw_systems, "weights": figures.draw_weights}
-        wanted = [(name, partial(draw[name], plan, results, folder, resolution)) for name in _DRAWN[plan.experiment.name]]
-        wanted.append(("sequences", partial(figures.draw_sequences, plan, results, folder)))
-    drawn = []
-    for name, make in wanted:
-        try:
-            made = make()
-        except (UserError, ValueError, OSError) as error:
-            log.warning("warning: cannot draw the figure %s: %s", name, error)
-            continue
-        if made is not None:
-            drawn.append(made)
-    return drawn
 
 
 def _figures_text(figures: Sequence[tuple[Path, str]], folder: Path) -> str:

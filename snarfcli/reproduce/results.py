@@ -89,6 +89,7 @@ MORE_COLUMNS = (
            ("weights", "wrong_share"), 100),
     Column("right_bone", "right bone %", "vertices whose heaviest bone is the same as in the body model, %", "id",
            ("weights", "right_bone"), 100),
+    Column("steps", "steps", "number of training steps", "train", ("steps",), 1, 0),
 )  # fmt: skip
 """Columns of the second table; columns without a number are left out."""
 
@@ -103,6 +104,8 @@ class Metrics:
     """The machine."""
     versions: dict[str, Any] = field(default_factory=dict)
     """Versions of packages."""
+    validations: list[dict[str, Any]] = field(default_factory=list)
+    """Validations of a training, with the number of steps before each."""
     code: dict[str, Any] = field(default_factory=dict)
     """Version of the code; see `snarfcli.versions.recorded_code`."""
     content: dict[str, Any] = field(default_factory=dict)

@@ -98,7 +98,7 @@ class Trainer:
         self.processor_s: float | None = 0.0
         """Processor time of the steps, of all threads and in all parts of the run; None if a part did not record it."""
         self.validations: list[dict[str, float]] = []
-        """The validations so far: `step`, `seconds` of training, and the numbers of `validate`."""
+        """The validations so far: `step`, `seconds` and `processor_s` of training, and the numbers of `validate`."""
 
     def advance(self) -> StepNumbers:
         """Take one step, or start it on a device, and return its losses and counts, which are read when they are asked for.
@@ -245,7 +245,8 @@ class Trainer:
         )
         self.validations = [one for one in self.validations if one["step"] < self.step]  # a resumed run validates again
         if found:
-            self.validations.append({"step": self.step, "seconds": round(self.seconds, 2)} | found)
+            processor = {} if self.processor_s is None else {"processor_s": round(self.processor_s, 2)}
+            self.validations.append({"step": self.step, "seconds": round(self.seconds, 2)} | processor | found)
         return found
 
     def state(self) -> dict[str, Any]:

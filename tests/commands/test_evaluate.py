@@ -15,6 +15,7 @@ from toy_training import avatar_config, new_avatar, toy_store
 from snarfcli.avatar import Avatar
 from snarfcli.commands import evaluate as commands
 from snarfcli.commands.evaluate import EvalConfig, run
+from snarfcli.commands.search_names import search_name
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.deformer import SearchConfig
 from snarfcli.errors import UserError
@@ -121,9 +122,10 @@ def test_out_of_distribution_goes_to_its_own_folder(config, caplog):
 
 def test_another_search_leaves_the_avatars_own_results(config):
     run(config)
-    run(replace(config, search=SearchConfig(name="broyden", init_bones=[0, 1], tolerance=5e-5)))
+    search = SearchConfig(name="broyden", init_bones=[0, 1], tolerance=5e-5)
+    run(replace(config, search=search))
     assert read(folder_of(config) / "eval_id")["search"]["name"] == "complete"
-    broyden = read(folder_of(config) / "eval_id_broyden")
+    broyden = read(folder_of(config) / f"eval_id_{search_name(search)}")
     assert broyden["search"]["init_bones"] == [0, 1]
     assert broyden["settings"]["search"]["name"] == "broyden"
 

@@ -120,3 +120,13 @@ def test_the_time_of_a_plan_is_that_of_its_busiest_process():
 def test_times_have_few_digits():
     assert time_text(float("inf")).endswith(" min")
     assert [time_text(seconds) for seconds in (0.4, 40, 100, 5900, 6100)] == ["0 s", "40 s", "2 min", "98 min", "1 h 42 min"]
+
+
+def test_a_budget_of_minutes_is_its_own_estimate(tmp_path):
+    plan = fake_plan(tmp_path, "minutes", systems=("papers_recipe-2", "papers_recipe-20", "ours-2"))
+    known = durations_of(plan, tmp_path)
+    assert [(known.of(job).source, known.of(job).train_s) for job in plan.jobs] == [("budget", s) for s in (240, 2400, 240)]
+    assert longest_first(plan.jobs, known)[0].row == "papers_recipe-20"
+    assert len({job.kind for job in plan.jobs}) == 3, "the settings of the first two differ in their budget alone"
+    fake_run(plan.jobs[0], {"id": 0.9, "ood": 0.8}, spent_s={"speed": 100.0, "train": 300.0, "id": 30.0, "ood": 10.0})
+    assert durations_of(plan, tmp_path).of(plan.jobs[0]).train_s == 400, "with the measurement of the speed"

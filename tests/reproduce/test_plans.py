@@ -29,7 +29,8 @@ def test_every_row_of_every_experiment_has_settings_of_the_commands(name, tmp_pa
     subjects = experiment.subjects[experiment.data[0]]
     for subject in subjects:
         fake_samples(tmp_path, subject, experiment.data[0])
-    plan = make_plan(experiment, ExperimentOptions(data_root=str(tmp_path), seeds=(0, 1)), resolve_training)
+    systems = tuple(row.key for row in experiment.rows)
+    plan = make_plan(experiment, ExperimentOptions(data_root=str(tmp_path), seeds=(0, 1), systems=systems), resolve_training)
     assert len(plan.jobs) == 2 * len(subjects) * len(experiment.rows)
     for job in plan.jobs:
         check_overrides(overrides_of(job.train), TrainConfig, "train")
@@ -56,6 +57,13 @@ def test_a_key_stands_for_one_set_of_overrides():
         assert set(experiment.order) <= set(keys)
         for row in experiment.rows if experiment.name in ("table1", "table2") else ():
             assert row.paper is None or paper_numbers(experiment.name, row.paper), row.key
+
+
+def test_optional_rows_are_there_when_they_are_named(tmp_path):
+    assert "snarf-hour" not in {job.row for job in fake_plan(tmp_path).jobs}
+    job = fake_plan(tmp_path, systems=("snarf-hour",)).jobs[0]
+    config = resolve_training([one for one in job.train[2:] if one.split("=")[0] in ("training", "model", "search")])
+    assert (config["search"]["init_bones"], config["search"]["max_steps"]) == (None, 20), "SNARF's own search"
 
 
 def test_other_settings_have_other_folders_and_machines_do_not_matter(tmp_path):
@@ -117,7 +125,8 @@ def test_all_runs_what_experiments_share_once(tmp_path):
     chosen = choose_experiments("all", ExperimentOptions(data="dfaust", subjects=("50002",), training="paper"))
     assert [(one.name, part.data, part.subjects, part.training) for one, part in chosen] == [
         ("table1", "dfaust", ("50002",), "paper"), ("table2", "dfaust", ("50002",), "paper"),
-        ("ablations", "dfaust", ("50002",), "paper"), ("stick2d", None, (), None), ("clothed", "cape", (), "paper"),
+        ("ablations", "dfaust", ("50002",), "paper"), ("minutes", "dfaust", ("50002",), "paper"),
+        ("stick2d", None, (), None), ("clothed", "cape", (), "paper"),
     ]  # fmt: skip
     plans = [fake_plan(tmp_path, name) for name in ("table1", "table2", "ablations")]
     jobs = unique_jobs(plans)

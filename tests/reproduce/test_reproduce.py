@@ -35,8 +35,10 @@ def call(capsys, *arguments):
 
 
 WRONG = {
-    ("tabel1",): "what: wanted table1, table2, ablations, stick2d, clothed or all, got 'tabel1'; did you mean 'table1'?",
-    (): "what: wanted table1, table2, ablations, stick2d, clothed or all, got none",
+    (
+        "tabel1",
+    ): "what: wanted table1, table2, ablations, minutes, stick2d, clothed or all, got 'tabel1'; did you mean 'table1'?",
+    (): "what: wanted table1, table2, ablations, minutes, stick2d, clothed or all, got none",
     ("table1", "systems=[nsa]"): "there is no row 'nsa'; did you mean 'nasa'?",
     ("table1", "training=quik"): "there is no training=quik; did you mean 'quick'?",
     ("table1", "data=cap"): "data: wanted builtin or dfaust for table1, got 'cap'",
@@ -156,7 +158,8 @@ def test_a_whole_table_of_a_toy(tmp_path, monkeypatch, caplog):
     }  # fmt: skip
     assert all(0 <= float(of_runs["ours-local"][name]) <= 100 for name in ("bbox_id", "surface_id", "bbox_ood", "surface_ood"))
     assert (folder / of_runs["ours-local"]["ood_file"]).is_file()
-    assert (folder / "figures/systems.png").is_file()
+    drawn = {path.name for path in (folder / "figures").iterdir()}
+    assert drawn == {"systems.png", "weights.png", "training.png", "frames.png"}, "one sequence has no curve"
     assert "**Unfinished: 2 of 3 runs done**; the section Not done says why." in text
     assert "2 of 3: Back-D, subject toy, seed 0: failed (train: no such luck)" in caplog.text
     known = (tmp_path / "outputs/reproduce/durations.json").read_text()

@@ -38,7 +38,8 @@ def recorded_code() -> dict[str, str]:
     """Return the version of the code: `digest`, a hash of its files, and in a checkout `commit`, "-dirty" if it has changes.
 
     The digest covers Python files, configuration and native sources. It is the same for the same files in any folder, but an
-    installed package has no native sources, so its digest differs from that of its checkout.
+    installed package has no native sources, so its digest differs from that of its checkout. The files are read once, so a
+    command that works for long calls this when it begins.
     """
     commit = _commit(_PACKAGE.parent)
     return {"digest": _digest(_PACKAGE)} | ({} if commit is None else {"commit": commit})
@@ -50,7 +51,7 @@ def _digest(package: Path) -> str:
     folders = [package] if inside.is_dir() else [package, package.parent / "conf", package.parent / "csrc"]
     known = hashlib.sha256()
     for folder in folders:
-        paths = (path for pattern in _SOURCES for path in folder.rglob(pattern))
+        paths = (path for pattern in _SOURCES for path in folder.rglob(pattern) if path.is_file())
         for name, path in sorted((path.relative_to(folder.parent).as_posix(), path) for path in paths):
             known.update(f"{name}\0{hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
     return known.hexdigest()[:12]

@@ -19,9 +19,9 @@ from snarfcli.commands.preprocess import PreprocessConfig
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.hydra_config.launchers import is_installed
 from snarfcli.parallel import run_in_processes
-from snarfcli.reproduce.jobs import run_command
 from snarfcli.reproduce.launchers import Launcher
 from snarfcli.reproduce.launching import launch
+from snarfcli.reproduce.running import run_command
 from snarfcli.safe_start import safe_environment, safe_imports, snarf_command
 
 NAMES = ("signal", "struct", "pickle", "json", "random", "multiprocessing", "socket", "torch", "numpy", "hydra", "snarfcli")

@@ -28,7 +28,7 @@ NOTE_FOLDER = f"+hydra.callbacks.snarf._target_={__name__}.SweepFolder"
 
 
 class SweepFolder(Callback):
-    """Notes the folder of a multirun, which the processes and machines of all its jobs can write to."""
+    """Records the folder of a multirun, which the processes and machines of all its jobs can write to."""
 
     path: ClassVar[Path | None] = None
     """The folder of the multirun that this process has started last."""
@@ -36,7 +36,7 @@ class SweepFolder(Callback):
     """Where its launcher keeps what jobs print; None if they print as this process does."""
 
     def on_multirun_start(self, config: Any, **more: Any) -> None:
-        """Note the folder; called by Hydra."""
+        """Record the folder; called by Hydra."""
         SweepFolder.path = Path(config.hydra.sweep.dir)
         kept = config.hydra.launcher.get("submitit_folder")
         SweepFolder.output = None if kept is None else str(Path(kept).parent)

@@ -35,6 +35,7 @@ from snarfcli.runs import choose_device, find_avatar, machine_facts, seed_everyt
 from snarfcli.samples.layout import samples_folder
 from snarfcli.samples.store import SampleStore
 from snarfcli.texts import counted, one_line
+from snarfcli.versions import recorded_code
 
 __all__ = ["EvalConfig", "run"]
 
@@ -104,6 +105,7 @@ def run(config: EvalConfig) -> None:
     device = choose_device(config.device)
     set_threads(config.threads)
     seed_everything(config.seed)
+    recorded_code()  # now, as the files may change while it measures
     store = SampleStore.open(config.data_root, config.data.name, config.subject)
     sequences = store.sequences(STORE_SPLITS[config.split])
     avatar = Avatar.load(path, device).with_precision(config.precision)

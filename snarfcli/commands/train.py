@@ -38,6 +38,7 @@ from snarfcli.texts import counted
 from snarfcli.training.loop import train
 from snarfcli.training.rough_shape import rough_canonical_points
 from snarfcli.training.trainer import CHECKPOINT_FORMAT, CHECKPOINT_VERSION, Diverged, Trainer
+from snarfcli.versions import recorded_code
 
 __all__ = ["TrainConfig", "new_trainer", "run"]
 
@@ -54,6 +55,7 @@ def run(config: TrainConfig) -> None:
     check_settings(config)
     folder = run_folder(config.output_root, config.data.name, config.subject, config.run)
     device = choose_device(config.device)
+    recorded_code()  # now, as the files may change while it trains
     with hold_output(folder, "snarf train", wait=config.wait):
         remove_temporaries(folder)
         trainer = _prepare(config, folder, device)

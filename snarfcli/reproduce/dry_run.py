@@ -9,10 +9,10 @@ from pathlib import Path
 
 from snarfcli.errors import UserError
 from snarfcli.reproduce.durations import Durations, plan_seconds, time_text
-from snarfcli.reproduce.jobs import JobStopped
 from snarfcli.reproduce.measuring import Measurements
 from snarfcli.reproduce.plans import Job, Plan
 from snarfcli.reproduce.progress import left_seconds
+from snarfcli.reproduce.running import JobStopped
 from snarfcli.texts import counted
 
 __all__ = ["measure_missing", "print_commands", "print_durations"]
@@ -32,9 +32,7 @@ def print_commands(jobs: Sequence[Job]) -> None:
                 log.info("  snarf %s", " ".join(samples.arguments))
             made.add(samples.folder)
         if job.minutes is not None:
-            log.info(
-                "  with as many training.steps as fit into %g minutes of one core, by a short training before", job.minutes
-            )
+            log.info("  with as many training.steps as fit into %g minutes of one core, by short trainings before", job.minutes)
         for arguments in (job.train, *(evaluation.arguments for evaluation in job.evaluations)):
             log.info("  snarf %s", " ".join(arguments))
 

@@ -227,9 +227,9 @@ _MINUTES = Experiment(
     notes=(
         "Minutes are those of two cores, counted as processor time: 2 min are 4 minutes of one core. Every training has one "
         "thread, so other work on the machine hardly changes the result. Loading, validation and evaluation do not count.",
-        "A training takes as many steps as fit: a short training of 120 steps with the same settings measures the time of a "
-        "step first, without its first 20 steps. *core min* is the processor time that the training then took. On a GPU the "
-        "wall time counts instead.",
+        "A training takes as many steps as fit: a short training with the same settings measures the time of a step first, "
+        "without its first steps, in about a tenth of the minutes and at most 120 steps. *core min* is the processor time that "
+        "the training then took. On a GPU the wall time counts instead.",
         "The papers' recipe is training=paper search=broyden search.jacobian=broyden: their networks (shape=mlp "
         "skinning=distilled), search from nine bones, blend, sampling, start, losses and constant learning rate.",
         "Ours with the papers' networks has our search, sampling, start, losses, learning rates and condition=local. Ours is "

@@ -8,6 +8,7 @@ import signal
 from pathlib import Path
 
 from snarfcli.errors import LOST_DRIVE, is_out_of_memory
+from snarfcli.texts import one_line
 
 __all__ = ["AGAIN", "ALONE", "reason_of", "retry_of", "retry_of_error"]
 
@@ -23,6 +24,7 @@ _SIGNALS = {"SIGKILL": ALONE, "SIGBUS": AGAIN, "SIGSEGV": AGAIN, "SIGABRT": AGAI
 _MEMORY = re.compile(r"(?:not enough|out of|more) memory|memory ran out")
 _DRIVE = re.compile(r"network drive|disk reports an error")
 _USER_ERROR = 2
+_LONGEST = 2000  # characters of a reason
 
 
 def reason_of(log: Path, begin: int, code: int) -> str:
@@ -41,7 +43,8 @@ def reason_of(log: Path, begin: int, code: int) -> str:
     if code < 0:
         why = " (out of memory?)" if _signal_name(code) == "SIGKILL" else ""
         return f"ended by {_signal_name(code)}{why}"
-    return last.removeprefix("snarf ").partition(": ")[2] if last.startswith("snarf ") else last or f"exit code {code}"
+    own = last.removeprefix("snarf ").partition(": ")[2] if last.startswith("snarf ") else ""
+    return one_line(own or last, _LONGEST) or f"exit code {code}"
 
 
 def retry_of(code: int, reason: str) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -14,12 +12,12 @@ from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json, remove_temporaries, write_json
-from snarfcli.locks import inherited_locks, locked
+from snarfcli.locks import locked
 from snarfcli.output_locks import clear_killed
 from snarfcli.reproduce.failures import AGAIN, ALONE, reason_of, retry_of
 from snarfcli.reproduce.plans import EvaluationStage, Job
-from snarfcli.reproduce.speed import clear_speed, measured_steps, speed_arguments, timed_arguments
-from snarfcli.safe_start import safe_environment, snarf_command
+from snarfcli.reproduce.running import JobStopped, Runner, processor_s_of_children, run_command
+from snarfcli.reproduce.speed import count_steps, timed_arguments
 from snarfcli.samples.layout import samples_folder
 from snarfcli.texts import one_line
 
@@ -28,13 +26,9 @@ __all__ = [
     "STATES",
     "STATUS",
     "JobStatus",
-    "JobStopped",
-    "Runner",
     "is_evaluated",
-    "processor_s_of_children",
     "read_job_status",
     "read_status",
-    "run_command",
     "run_job",
 ]
 
@@ -47,13 +41,6 @@ STATES = ("running", "done", "failed", "diverged", "stopped")
 """States of a run."""
 
 _LOCK = ".reproduce.lock"
-_LOOK_EVERY_S = 0.3
-# Time between Ctrl-C and SIGKILL: a training step or a frame of an evaluation, and a checkpoint.
-_PATIENCE_S = 90.0
-
-
-class JobStopped(Exception):
-    """The plan was interrupted."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +69,6 @@ class JobStatus:
     """Whether it may help to try a failed run once more: `failures.AGAIN` or `failures.ALONE`; empty if not."""
     steps: int | None = None
     """Number of training steps that fit into the minutes of the job, as it was measured; None if the job has no such budget."""
-
-
-Runner = Callable[[Sequence[str], Path, Callable[[], bool]], int]
-"""Runs `snarf` with arguments, appends its output to a file, regularly asks whether to stop, and returns its exit code."""
 
 
 def run_job(
@@ -144,7 +127,8 @@ def read_job_status(path: Path) -> JobStatus | None:
     except (UserError, DescriptionError):
         return None
     retry = status.retry if status.retry in (AGAIN, ALONE) else ""
-    status = replace(status, stage=one_line(status.stage, 20), reason=one_line(status.reason, 500), retry=retry)
+    steps = None if status.steps is None or status.steps < 1 else status.steps
+    status = replace(status, stage=one_line(status.stage, 20), reason=one_line(status.reason, 500), retry=retry, steps=steps)
     return status if status.state in STATES else None
 
 
@@ -213,16 +197,14 @@ class _Stages:
         if self.job.minutes is None:
             return self.job.train
         if self.status.steps is None:
-            clear_speed(self.job)
             try:
-                if not self._stage("speed", speed_arguments(self.job)):
-                    return None
-                self._write(steps=measured_steps(self.job))
+                steps = count_steps(self.job, lambda arguments: self._stage("speed", arguments))
             except UserError as error:
                 self.status = replace(self.status, state="failed", reason=str(error))
                 return None
-            finally:
-                clear_speed(self.job)
+            if steps is None:
+                return None
+            self._write(steps=steps)
         assert self.status.steps is not None
         return timed_arguments(self.job, self.status.steps)
 
@@ -276,64 +258,9 @@ class _Stages:
         write_json(self.folder / STATUS, asdict(self.status))
 
 
-def run_command(arguments: Sequence[str], log: Path, stopped: Callable[[], bool]) -> int:
-    """Run `snarf` in a new process and return its exit code; see `Runner`.
-
-    The command waits while another one writes to its output folder, such as one that a killed `snarf reproduce` has left. It
-    inherits the locks of this process, so that the run stays locked until the command has ended, however this process ends.
-
-    Raises:
-        JobStopped: it was interrupted because `stopped` returned True.
-    """
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as file:
-        file.write(f"$ snarf {' '.join(arguments)}\n")
-        file.flush()
-        process = subprocess.Popen(
-            snarf_command([*arguments, "wait=true"]), env=safe_environment(),
-            stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT, pass_fds=inherited_locks(),
-        )  # fmt: skip
-        try:
-            code, was_asked = _wait(process, stopped)
-        except BaseException:
-            process.kill()
-            process.wait()
-            raise
-    if was_asked and code != 0:
-        raise JobStopped
-    return code
-
-
-def _wait(process: subprocess.Popen[bytes], stopped: Callable[[], bool]) -> tuple[int, bool]:
-    """Wait for a command; return its exit code, and whether it was asked to end.
-
-    It is asked when `stopped` returns True, or this process is asked to end. A second request raises.
-    """
-    asked_s: float | None = None
-    while True:
-        try:
-            return process.wait(_LOOK_EVERY_S), asked_s is not None
-        except (subprocess.TimeoutExpired, KeyboardInterrupt) as reason:
-            is_request = isinstance(reason, KeyboardInterrupt)
-            if is_request and asked_s is not None:
-                raise
-            if asked_s is None and (is_request or stopped()):
-                # as Ctrl-C, after which a training writes its checkpoint; but commands in the background ignore that
-                process.terminate()
-                asked_s = time.monotonic()
-            elif asked_s is not None and time.monotonic() - asked_s > _PATIENCE_S:
-                process.kill()
-
-
 def _plus(times: dict[str, float], name: str, seconds: float) -> dict[str, float]:
     """Return times by stage, with more for one of them."""
     return times | {name: round(times.get(name, 0.0) + seconds, 2)}
-
-
-def processor_s_of_children() -> float:
-    """Return the processor time of all commands that this process has waited for, of all their threads; 0 on Windows."""
-    times = os.times()
-    return times.children_user + times.children_system
 
 
 def _samples_exist(folder: str) -> bool:

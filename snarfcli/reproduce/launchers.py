@@ -92,6 +92,8 @@ class _Child:
     slot: int
     before: JobStatus | None
     """Status of the job before this try."""
+    log_begin: int
+    """Where its output begins in the log of the job, bytes."""
 
 
 class LocalProcesses:
@@ -114,7 +116,7 @@ class LocalProcesses:
             code = child.process.poll()
             if code is not None:
                 del self._running[number]
-                self._check_end(number, code, child.before)
+                self._check_end(number, code, child)
         starting = [self._waiting.popleft() for _ in range(self._launcher.processes - len(self._running)) if self._waiting]
         if self._launcher.shares_cores:
             self._share_cores([*self._running, *starting])
@@ -131,7 +133,7 @@ class LocalProcesses:
             _kill_group(child.process)
 
     def _share_cores(self, numbers: Sequence[int]) -> None:
-        """Share the cores out among jobs; those that run longest get what is left over."""
+        """Share the cores out among jobs; those that began first get what is left over."""
         each, left = divmod(count_cores(), max(1, len(numbers)))
         shares = {number: max(1, each + (place < left)) for place, number in enumerate(numbers)}
         if shares != self._shares:
@@ -142,20 +144,20 @@ class LocalProcesses:
         used = {child.slot for child in self._running.values()}
         slot = next(slot for slot in count() if slot not in used)
         arguments = ["reproduce_job", f"plan={quote(str(plan_file(self._work)))}", f"job={number}"]
-        before = read_result(self._work, number)
-        process = _start(arguments, self._log_of(number), {SLOT_VARIABLE: str(slot)})
-        return _Child(process, slot, before)
+        before, log = read_result(self._work, number), self._log_of(number)
+        log_begin = log.stat().st_size if log.exists() else 0
+        return _Child(_start(arguments, log, {SLOT_VARIABLE: str(slot)}), slot, before, log_begin)
 
     def _log_of(self, number: int) -> Path:
         return self._work / f"{number}.log"
 
-    def _check_end(self, number: int, code: int, before: JobStatus | None) -> None:
+    def _check_end(self, number: int, code: int, child: _Child) -> None:
         """Record a failure if the process of a job has ended without the job's final status."""
-        status = read_result(self._work, number)
+        status, before = read_result(self._work, number), child.before
         if status is not None and status.state != "running" and status != before:
             return
         log = self._log_of(number)
-        reason = reason_of(log, 0, code)
+        reason = reason_of(log, child.log_begin, code)
         retry = retry_of(code, reason)
         if not (retry or has_results(self._work)):
             raise UserError(f"launcher=local started no job: {reason}; see {log}")

@@ -183,11 +183,11 @@ def _last_line(log_file: Path) -> str:
 
 
 def _stop(processes: Processes, work: Path) -> None:
-    """Ask all jobs to end and wait for them; on a second Ctrl-C kill them."""
-    ask_to_stop(work)
+    """Ask all jobs to end and wait for them; on a second Ctrl-C, or if they cannot be asked, kill them."""
     try:
+        ask_to_stop(work)
         processes.wait()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, OSError):  # as on a full disk, where no checkpoint could be written either
         processes.kill()
 
 

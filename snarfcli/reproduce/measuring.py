@@ -17,9 +17,9 @@ from snarfcli.evaluation.report import STORE_SPLITS
 from snarfcli.files import read_json
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.reproduce.durations import Duration, machine_name
-from snarfcli.reproduce.jobs import Runner, processor_s_of_children, run_command
 from snarfcli.reproduce.plans import EvaluationStage, Job
 from snarfcli.reproduce.results import look_up, read_metrics
+from snarfcli.reproduce.running import Runner, processor_s_of_children, run_command
 from snarfcli.runs import run_folder
 from snarfcli.samples.layout import samples_folder
 from snarfcli.texts import one_line

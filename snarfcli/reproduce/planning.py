@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +24,12 @@ from snarfcli.samples.layout import samples_folder
 
 __all__ = ["choose_experiments", "make_plan"]
 
+log = logging.getLogger(__name__)
+
 # The out-of-distribution poses of DFaust's subjects are another data set: PosePrior's motion on their bodies.
 _OTHER_OOD_DATA = {"dfaust": "poseprior"}
 _PARITY_FOLDER = "parity"
+_STEPS = "training.steps"
 _STEPS_OF_A_COST = 1200  # of training=quick, for which `Row.cost` is
 # For the curves of a training: its number of validations, and of frames out of distribution in each.
 _VALIDATIONS = 6
@@ -47,7 +51,8 @@ def choose_experiments(what: str | None, options: ExperimentOptions) -> list[tup
     """Return the experiments that a name stands for, each with the options that apply to it.
 
     With `all`, data, subjects and training are options of the tables of bodies. The 2D stick keeps its own. The clothed
-    experiment uses CAPE if a licensed data set is given, and the built-in garment otherwise.
+    experiment uses CAPE if a licensed data set is given, and the built-in garment otherwise. Rows with a budget of minutes are
+    left out if the number of steps is given.
 
     Raises:
         UserError: there is no such experiment, or no experiment has one of the systems.
@@ -61,6 +66,10 @@ def choose_experiments(what: str | None, options: ExperimentOptions) -> list[tup
     chosen = []
     for experiment in EXPERIMENTS.values():
         known = tuple(row for row in options.systems if row in {r.key for r in experiment.rows})
+        is_timed = any(row.minutes is not None for row in experiment.rows)
+        if is_timed and _sets_steps(options.extra) and not known:
+            log.info("%s is left out, since its minutes and %s exclude each other", experiment.name, _STEPS)
+            continue
         if options.systems and not known:
             continue
         part = replace(options, systems=known)
@@ -220,13 +229,22 @@ def _check_extra(extra: Sequence[str], rows: Sequence[Row]) -> None:
     """Check that the further settings are not among those that the plan sets itself."""
     timed = [row.key for row in rows if row.minutes is not None]
     for override in extra:
-        name = override.partition("=")[0].lstrip("+")
+        name = _name(override)
         if name in _OWN_SETTINGS:
             raise UserError(f"extra: {name} is set by reproduce itself; give {_OWN_SETTINGS[name]}")
-        if timed and name == "training.steps":
+        if timed and name == _STEPS:
             raise UserError(
                 f"extra: {name} follows from the minutes of row {timed[0]}; leave it out, or choose other systems=[...]"
             )
+
+
+def _sets_steps(extra: Sequence[str]) -> bool:
+    return _STEPS in map(_name, extra)
+
+
+def _name(override: str) -> str:
+    """Return the name of the setting of an override."""
+    return override.partition("=")[0].lstrip("+")
 
 
 def _check_subjects(

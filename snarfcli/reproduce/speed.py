@@ -1,8 +1,9 @@
-"""Trainings with a budget of minutes: a short training measures the time of a step, from which the number of steps follows."""
+"""Trainings with a budget of minutes: short trainings measure the time of a step, from which the number of steps follows."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,27 @@ from snarfcli.files import read_json
 from snarfcli.hydra_config.overrides import quote
 from snarfcli.reproduce.plans import Job
 
-__all__ = ["SPEED_FOLDER", "clear_speed", "measured_steps", "speed_arguments", "timed_arguments"]
+__all__ = ["count_steps", "timed_arguments"]
 
-SPEED_FOLDER = "speed"
-"""Name of the folder of the short training, in the run folder."""
-
-# The first steps take longer: memory is allocated and code is loaded. The 100 steps after them are like any 100 of the presets:
-# every 4th has the loss for made-up poses, and one updates the cells. In training=quick, the steps 21 to 120 took 0.047 s of
-# one core each, and so did the steps 301 to 1,200.
-_UNCOUNTED, _STEPS = 20, 120
+_FOLDER = "speed"  # of the short trainings, in the run folder
+_SHARE = 0.1  # of the budget that the steps of the second short training may take
 _VALIDATIONS, _VALIDATION_FRAMES = 12, 8  # of the training, for its curve; rows with other presets have the same frames
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """Length of a short training."""
+
+    uncounted: int
+    """Number of its first steps, which take longer: memory is allocated and code is loaded."""
+    steps: int
+    """Number of all its steps, a multiple of `uncounted`."""
+
+
+_FIRST = _Probe(4, 8)  # ten seconds of the slowest row; every 4th step of the presets has the loss for made-up poses
+# 100 steps are like any 100 of the presets: every 4th has the loss for made-up poses, and one updates the cells. In
+# training=quick, the steps 21 to 120 took 0.047 s of one core each, and so did the steps 301 to 1,200.
+_LONGEST = _Probe(20, 120)
 
 
 @dataclass(frozen=True)
@@ -61,34 +73,29 @@ class _Metrics:
     """The machine."""
 
 
-def speed_arguments(job: Job) -> tuple[str, ...]:
-    """Return the arguments of `snarf` for the short training: the first steps of the training of a job, in another folder."""
-    return (
-        *job.train, f"training.steps={_STEPS}", f"training.validate_every={_UNCOUNTED}", "training.validation_frames=1",
-        "training.validation_ood_frames=0", f"output_root={quote(str(Path(job.folder) / SPEED_FOLDER))}",
-    )  # fmt: skip
+def count_steps(job: Job, run: Callable[[Sequence[str]], bool]) -> int | None:
+    """Return how many steps fit into the minutes of a job, at least 1; None if a short training has failed.
 
+    A first short training tells how many steps fit into a tenth of the minutes; a second one of so many steps, at most 120,
+    measures them. The second is left out if it would not be longer. The processor time counts, which other work on the machine
+    hardly changes; on a GPU the wall time.
 
-def clear_speed(job: Job) -> None:
-    """Delete the short training of a job, if there is one."""
-    shutil.rmtree(Path(job.folder) / SPEED_FOLDER, ignore_errors=True)
-
-
-def measured_steps(job: Job) -> int:
-    """Return how many steps fit into the minutes of a job, from the metrics of its short training; at least 1.
-
-    Its processor time counts, which other work on the machine hardly changes; on a GPU the wall time.
+    Args:
+        job: a job with a budget.
+        run: runs `snarf` with arguments and returns whether it has succeeded.
 
     Raises:
-        UserError: the metrics are missing or damaged.
+        UserError: the metrics of a short training are missing or damaged.
     """
     assert job.minutes is not None
-    path = Path(job.folder) / SPEED_FOLDER / job.data / job.subject / Path(job.folder).name / "metrics.json"
-    try:
-        step_s = _step_s(read_described(_Metrics, read_json(path, "metrics"), "metrics", ignore_unknown=True))
-    except DescriptionError as error:
-        raise UserError(f"cannot measure the time of a step, since {path} is damaged ({error})") from None
-    return max(1, round(60 * job.minutes / step_s))
+    budget_s = 60 * job.minutes
+    step_s = _measure(job, _FIRST, run)
+    if step_s is None:
+        return None
+    second = _probe_of(_SHARE * budget_s / step_s)
+    if second.steps > _FIRST.steps:
+        step_s = _measure(job, second, run)
+    return None if step_s is None else max(1, round(budget_s / step_s))
 
 
 def timed_arguments(job: Job, steps: int) -> tuple[str, ...]:
@@ -102,12 +109,47 @@ def timed_arguments(job: Job, steps: int) -> tuple[str, ...]:
     return (*job.train, f"training.steps={steps}", *of_curve)
 
 
-def _step_s(metrics: _Metrics) -> float:
+def _probe_of(steps: float) -> _Probe:
+    """Return the longest short training of at most a number of steps."""
+    parts = _LONGEST.steps // _LONGEST.uncounted
+    uncounted = min(_LONGEST.uncounted, int(steps / parts))
+    return _Probe(uncounted, parts * uncounted)
+
+
+def _measure(job: Job, probe: _Probe, run: Callable[[Sequence[str]], bool]) -> float | None:
+    """Run a short training and return the time of a step in seconds; None if it has failed."""
+    folder = Path(job.folder) / _FOLDER
+    arguments = (
+        *job.train, f"training.steps={probe.steps}", f"training.validate_every={probe.uncounted}",
+        "training.validation_frames=1", "training.validation_ood_frames=0", f"output_root={quote(str(folder))}",
+    )  # fmt: skip
+    shutil.rmtree(folder, ignore_errors=True)  # one that was killed, or that had another number of steps
+    try:
+        if not run(arguments):
+            return None
+        return _step_s(_read_metrics(folder / job.data / job.subject / Path(job.folder).name / "metrics.json"), probe)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _read_metrics(path: Path) -> _Metrics:
+    """Return the metrics of a short training.
+
+    Raises:
+        UserError: they are missing or damaged.
+    """
+    try:
+        return read_described(_Metrics, read_json(path, "metrics"), "metrics", ignore_unknown=True)
+    except DescriptionError as error:
+        raise UserError(f"the time of a step is unknown: {path} is damaged ({error}); run the same command again") from None
+
+
+def _step_s(metrics: _Metrics, probe: _Probe) -> float:
     """Return the time of a step in seconds: of those after the first ones, or of all if nothing was measured in between."""
     on_gpu = "gpu" in metrics.machine
     times = {one.step: one.seconds if on_gpu or one.processor_s is None else one.processor_s for one in metrics.validations}
-    if _UNCOUNTED in times and _STEPS in times:
-        step_s = (times[_STEPS] - times[_UNCOUNTED]) / (_STEPS - _UNCOUNTED)
+    if probe.uncounted in times and probe.steps in times:
+        step_s = (times[probe.steps] - times[probe.uncounted]) / (probe.steps - probe.uncounted)
     elif on_gpu or metrics.timings.processor_s is None:
         step_s = metrics.timings.seconds_per_step
     else:

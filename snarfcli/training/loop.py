@@ -41,13 +41,13 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
     """
     config = trainer.config
     first_step, seconds_before, processor_before = trainer.step, trainer.seconds, trainer.processor_s
-    start, processor_start, shown_at = time.monotonic(), time.process_time(), 0.0
     recent, written = History(_LAST_STEPS), first_step
     validation: dict[str, float] = {}
     points_per_step = config.poses_per_step * (config.uniform_points + config.surface_points)
     paused = processor_paused = 0.0
     if is_due(first_step, config.validate_every) and not any(one["step"] == first_step for one in trainer.validations):
         trainer.validate()  # the run was interrupted between a checkpoint and this validation
+    start, processor_start, shown_at = time.monotonic(), time.process_time(), 0.0
 
     bar = progress_bar(total=config.steps, done=first_step, desc="train", unit="step")
     with closing(trainer.batches), interrupts_noted(_tell_of_interrupt) as interrupt, bar as shown:
@@ -68,16 +68,16 @@ def train(trainer: Trainer, folder: Path, *, on_scalars: Callable[[int, dict[str
             if interrupt:
                 raise interrupt.as_error()
             if validates:
-                before, processor_of_steps = time.monotonic(), time.process_time()
+                since, processor_since = time.monotonic(), time.process_time()
                 with interrupt.at_once():
                     validation = trainer.validate()
                 on_scalars(step, {f"validation_{name}": value for name, value in validation.items()})
-                paused += time.monotonic() - before
-                processor_paused += time.process_time() - processor_of_steps
+                paused += time.monotonic() - since
+                processor_paused += time.process_time() - processor_since
             if shown is not None:
                 shown.update(step - shown.n)
-            since = seconds + paused - shown_at
-            if since >= (_REPORT_EVERY_S if shown is None else _SHOW_EVERY_S) or last:
+            unseen = seconds + paused - shown_at
+            if unseen >= (_REPORT_EVERY_S if shown is None else _SHOW_EVERY_S) or last:
                 shown_at = seconds + paused
                 line = _line(recent, validation, speed * points_per_step)
                 if shown is not None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 from toy_training import avatar_config, new_avatar, toy_store
 
+from snarfcli import versions
 from snarfcli.avatar import Avatar
 from snarfcli.commands import evaluate as commands
 from snarfcli.commands.evaluate import EvalConfig, run
@@ -108,6 +109,22 @@ def test_metrics_say_what_was_measured(config):
     assert metrics["timings"]["total_s"] > 0
     assert {"snarf", "torch", "python"} <= set(metrics["versions"])
     assert [path.name for path in (folder_of(config) / "eval_id").iterdir()] == ["metrics.json"]
+
+
+def test_the_version_of_the_code_is_that_of_the_beginning(config, monkeypatch):
+    digest = ["before"]
+    monkeypatch.setattr(versions, "_digest", lambda package: digest[0])
+    versions.recorded_code.cache_clear()
+    work = commands.evaluate
+
+    def later(*given, **named):
+        digest[0] = "after"
+        return work(*given, **named)
+
+    monkeypatch.setattr(commands, "evaluate", later)
+    run(config)
+    versions.recorded_code.cache_clear()
+    assert read(folder_of(config) / "eval_id")["code"]["digest"] == "before"
 
 
 def test_out_of_distribution_goes_to_its_own_folder(config, caplog):

@@ -12,7 +12,9 @@ import pytest
 import torch
 from toy_training import avatar_config, toy_store, training_config
 
+from snarfcli import versions
 from snarfcli.avatar import Avatar
+from snarfcli.commands import train as commands
 from snarfcli.commands.train import TrainConfig, run
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
@@ -76,6 +78,22 @@ def test_the_run_folder_holds_all_that_a_run_should(config, caplog):
     assert "data: builtin, subject toy, 1 sequence, 11 frames to train on" in caplog.text
     assert "points/s" in caplog.text
     assert "validation (held-back motion): IoU bbox" in caplog.text
+
+
+def test_the_version_of_the_code_is_that_of_the_beginning(config, monkeypatch):
+    digest = ["before"]
+    monkeypatch.setattr(versions, "_digest", lambda package: digest[0])
+    versions.recorded_code.cache_clear()
+    work = commands.train
+
+    def later(*given, **named):
+        digest[0] = "after"
+        return work(*given, **named)
+
+    monkeypatch.setattr(commands, "train", later)
+    run(config)
+    versions.recorded_code.cache_clear()
+    assert json.loads((folder_of(config) / "metrics.json").read_text())["code"]["digest"] == "before"
 
 
 def test_an_interrupted_run_resumes_to_the_same_avatar(config, monkeypatch, caplog):

@@ -93,3 +93,8 @@ def test_the_reason_is_the_last_line_of_the_last_command(tmp_path):
     log.write_text(log.read_text() + "ValueError: a fault\n")
     assert reason_of(log, begin, 1) == "ValueError: a fault"
     assert reason_of(log, begin, -99) == "ended by signal 99"
+    log.write_text(log.read_text() + "snarf of a program without colons\n")
+    assert reason_of(log, begin, 1) == "snarf of a program without colons"
+    log.write_text(log.read_text() + f"ValueError: \x1b[2J{'long' * 100_000}\n")
+    assert reason_of(log, begin, 1).startswith("ValueError: [2Jlong"), "no control characters"
+    assert len(reason_of(log, begin, 1)) == 2000, "a status with longer texts could not be read again"

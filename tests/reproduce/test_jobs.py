@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +13,9 @@ from fake_runs import fake_metrics, fake_plan, fake_samples
 
 from snarfcli.files import write_json
 from snarfcli.reproduce import jobs
-from snarfcli.reproduce.jobs import LOG, STATUS, JobStopped, read_status, run_command, run_job
+from snarfcli.reproduce.jobs import STATUS, read_status, run_job
 from snarfcli.reproduce.results import collect
+from snarfcli.reproduce.running import JobStopped
 
 
 class Player:
@@ -113,13 +112,6 @@ def test_times_of_all_calls_are_added(job, monkeypatch):
     assert run_job(other, runner=Slow(other)).spent_s["train"] == 10.0, "another run in the same folder"
 
 
-@pytest.mark.skipif(os.name != "posix", reason="the system tells the processor time of children on Unix alone")
-def test_the_processor_time_of_a_command_is_known(tmp_path):
-    before = jobs.processor_s_of_children()
-    run_command(["--version"], tmp_path / LOG, lambda: False)
-    assert jobs.processor_s_of_children() > before
-
-
 def test_a_stopped_plan_begins_nothing(job):
     player = Player(job)
     assert run_job(job, runner=player, stopped=lambda: True).state == "stopped"
@@ -192,29 +184,9 @@ def test_data_without_the_split_is_no_failure(job, tmp_path):
     assert player.calls == ["train", "id"]
 
 
-def test_a_command_says_what_it_said_and_why_it_failed(job, tmp_path):
-    log = tmp_path / LOG
-    assert run_command(["train", "training=quik"], log, lambda: False) == 2
-    assert log.read_text().startswith("$ snarf train training=quik\n")
-    assert "did you mean 'quick'" in log.read_text()
+def test_the_reason_of_a_real_command_is_told(job):
     wrong = type(job)(**{**vars(job), "train": ("train", "training=quik")})
     assert "there is no training=quik" in run_job(wrong).reason
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
-def test_a_command_that_is_stopped_is_asked_once(tmp_path, monkeypatch):
-    script = tmp_path / "program.py"
-    script.write_text(
-        "import signal, sys, time\n"
-        "def handle(*_): print('checkpoint written', flush=True); sys.exit(143)\n"
-        "signal.signal(signal.SIGTERM, handle)\nprint('ready', flush=True)\ntime.sleep(600)\n"
-    )
-    original = subprocess.Popen
-    monkeypatch.setattr(subprocess, "Popen", lambda command, **more: original([sys.executable, str(script)], **more))
-    log = tmp_path / LOG
-    with pytest.raises(JobStopped):
-        run_command(["train"], log, lambda: log.exists() and "ready" in log.read_text())
-    assert log.read_text().count("checkpoint written") == 1
 
 
 def test_a_command_that_is_killed_is_named(job):

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from fake_jobs import FakeJobs
@@ -13,8 +14,9 @@ from fake_jobs import FakeJobs
 from snarfcli.errors import UserError
 from snarfcli.files import read_json
 from snarfcli.reproduce import launchers
+from snarfcli.reproduce.jobs import JobStatus
 from snarfcli.reproduce.launchers import Launcher, LocalProcesses
-from snarfcli.reproduce.planned_jobs import read_result
+from snarfcli.reproduce.planned_jobs import read_result, write_result
 
 
 @pytest.fixture
@@ -103,6 +105,17 @@ def test_if_no_job_can_begin_the_first_one_says_why(work, tmp_path, monkeypatch)
     with pytest.raises(UserError, match=r"launcher=local started no job: cannot start; see .*0\.log"):
         run(work, 9, Launcher())
     assert fake.started() == [0]
+
+
+def test_a_try_that_says_nothing_does_not_get_the_reason_of_the_one_before(work):
+    log, before = work / "0.log", JobStatus("failed", retry="again")
+    log.write_text("snarf reproduce_job: old\n")
+    write_result(work, 0, before)
+    child = launchers._Child(cast(Any, None), 0, before, log.stat().st_size)
+    LocalProcesses(work, [], Launcher())._check_end(0, 3, child)
+    status = read_result(work, 0)
+    assert status is not None
+    assert (status.reason, status.tries) == ("exit code 3", 2)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks /proc whether a process works")

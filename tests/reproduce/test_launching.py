@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import json
 import logging
@@ -140,6 +141,24 @@ def test_jobs_do_not_outlive_an_error_of_the_call(jobs, tmp_path, monkeypatch):
     with pytest.raises(MemoryError):
         launch(jobs[:1], tmp_path / "work", Launcher(), fail)
     assert fake.events()[-1][:2] == [0, "end"], "it was waited for"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as on Unix")
+def test_jobs_that_cannot_be_asked_to_end_are_killed(jobs, tmp_path, monkeypatch):
+    fake = fake_jobs(tmp_path, monkeypatch, {0: ["hang"]})
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def fail() -> None:
+        if fake.hanging():
+            raise MemoryError
+
+    monkeypatch.setattr(launching, "ask_to_stop", full)
+    with pytest.raises(MemoryError):
+        launch(jobs[:1], tmp_path / "work", Launcher(), lambda *_: None, fail)
+    with pytest.raises(ProcessLookupError):  # it was waited for
+        os.kill(fake.hanging()[0], 0)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="whether a holder lives is only known on Unix")

@@ -13,8 +13,8 @@ from snarfcli.errors import UserError
 from snarfcli.files import write_json
 from snarfcli.reproduce import dry_run, measuring
 from snarfcli.reproduce.durations import Durations, machine_name
-from snarfcli.reproduce.jobs import JobStopped
 from snarfcli.reproduce.measuring import Measurements
+from snarfcli.reproduce.running import JobStopped
 
 STEP_S, VALIDATION_S, FRAME_S, START_S = 0.5, 4.0, 2.0, 5.0
 FIRST_STEPS_S = 3.0  # that the first steps take longer

@@ -128,6 +128,11 @@ def test_all_runs_what_experiments_share_once(tmp_path):
         ("ablations", "dfaust", ("50002",), "paper"), ("minutes", "dfaust", ("50002",), "paper"),
         ("stick2d", None, (), None), ("clothed", "cape", (), "paper"),
     ]  # fmt: skip
+    steps = ("training.steps=9",)
+    with_steps = [one.name for one, _ in choose_experiments("all", ExperimentOptions(extra=steps))]
+    assert with_steps == ["table1", "table2", "ablations", "stick2d", "clothed"], "the minutes of the other one exclude them"
+    with_row = choose_experiments("all", ExperimentOptions(extra=steps, systems=("ours-2",)))
+    assert [one.name for one, _ in with_row] == ["minutes"], "which is then an error that says so"
     plans = [fake_plan(tmp_path, name) for name in ("table1", "table2", "ablations")]
     jobs = unique_jobs(plans)
     assert len(jobs) == len({job.folder for plan in plans for job in plan.jobs}) < sum(len(plan.jobs) for plan in plans)

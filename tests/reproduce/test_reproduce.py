@@ -19,7 +19,8 @@ from snarfcli.commands import reproduce
 from snarfcli.commands.reproduce import ReproduceConfig, run
 from snarfcli.hydra_config.overrides import quote_items
 from snarfcli.hydra_config.schema import config_folder
-from snarfcli.reproduce.jobs import JobStatus, JobStopped, run_job
+from snarfcli.reproduce.jobs import JobStatus, run_job
+from snarfcli.reproduce.running import JobStopped
 
 
 @pytest.fixture

@@ -15,10 +15,11 @@ from snarfcli.errors import UserError
 from snarfcli.files import write_json
 from snarfcli.reproduce import speed
 from snarfcli.reproduce.experiments import EXPERIMENTS
-from snarfcli.reproduce.jobs import STATUS, JobStopped, run_job
+from snarfcli.reproduce.jobs import STATUS, run_job
 from snarfcli.reproduce.planning import make_plan
 from snarfcli.reproduce.plans import ExperimentOptions
-from snarfcli.reproduce.speed import measured_steps, speed_arguments, timed_arguments
+from snarfcli.reproduce.running import JobStopped
+from snarfcli.reproduce.speed import count_steps, timed_arguments
 
 
 @pytest.fixture
@@ -27,45 +28,76 @@ def job(tmp_path):
     return fake_plan(tmp_path, "minutes", systems=("ours-2",), threads=2).jobs[0]
 
 
-def at(step, seconds, processor_s):
-    return {"step": step, "seconds": seconds, "processor_s": processor_s, "iou_surface": 0.5}
+class ShortTrainings:
+    """Stand for `snarf`: write the metrics of short trainings, whose steps take some time after the first ones."""
 
+    def __init__(self, job, step_s=0.5, **changes) -> None:
+        self.job, self.step_s, self.changes, self.calls = job, step_s, changes, []
 
-def measured(job, **changes):
-    """Write the metrics of a short training, whose steps take 0.5 s of one core after the first ones."""
-    content = {
-        "steps": 120, "machine": {"cores": 2}, "timings": {"seconds_per_step": 0.8, "processor_s": 72.0},
-        "validations": [at(20, 30.0, 22.0), at(40, 43.0, 30.0), at(120, 96.0, 72.0)],
-    }  # fmt: skip
-    write_json(Path(job.folder) / "speed" / job.data / job.subject / Path(job.folder).name / "metrics.json", content | changes)
+    def __call__(self, arguments) -> bool:
+        self.calls.append(arguments)
+        folder = Path(self.job.folder) / "speed"
+        assert not folder.exists(), "each begins anew"
+        given = dict(argument.split("=", 1) for argument in arguments[1:])
+        steps, every = (int(given[f"training.{name}"]) for name in ("steps", "validate_every"))
+
+        def time_of(step):
+            return 9.0 + step * self.step_s  # the first steps take longer
+
+        content = {
+            "steps": steps, "machine": {"cores": 2},
+            "timings": {"seconds_per_step": 2.0 * self.step_s, "processor_s": time_of(steps)},
+            "validations": [
+                {"step": step, "seconds": 2 * time_of(step), "processor_s": time_of(step)}
+                for step in range(every, steps + 1, every)
+            ],
+        }  # fmt: skip
+        path = folder / self.job.data / self.job.subject / Path(self.job.folder).name / "metrics.json"
+        write_json(path, content | self.changes)
+        return True
+
+    def steps(self) -> list[int]:
+        """Return the number of steps of each."""
+        return [int(one.partition("=")[2]) for call in self.calls for one in call if one.startswith("training.steps=")]
 
 
 def test_steps_follow_from_the_processor_time_of_steps_after_the_first_ones(job):
     assert job.minutes == 4.0, "of one core"
-    measured(job)
-    assert measured_steps(job) == 480
-    measured(job, machine={"gpu": "H200"})
-    assert measured_steps(job) == round(240 / 0.66), "the wall time on a GPU"
-    measured(job, validations=[])
-    assert measured_steps(job) == 400, "no held-back frames, so the mean of all steps"
-    measured(job, validations=[], timings={"seconds_per_step": 0.8})
-    assert measured_steps(job) == 300
-    measured(job, timings={"seconds_per_step": 1000.0, "processor_s": 120_000.0}, validations=[])
-    assert measured_steps(job) == 1
-    measured(job, timings="fast")
-    with pytest.raises(
-        UserError, match=r"cannot measure the time of a step, since .*metrics.json is damaged \(metrics.timings"
-    ):
-        measured_steps(job)
+    assert count_steps(job, ShortTrainings(job)) == 480
+    assert count_steps(job, ShortTrainings(job, machine={"gpu": "H200"})) == 240, "the wall time on a GPU"
+    mean, processor = {"seconds_per_step": 0.8}, {"processor_s": 60.0}
+    trainings = ShortTrainings(job, steps=100, timings=mean | processor, validations=[])
+    assert count_steps(job, trainings) == 400, "no held-back frames, so the mean of all steps"
+    assert count_steps(job, ShortTrainings(job, timings=mean, validations=[])) == 300
+    assert count_steps(job, ShortTrainings(job, step_s=1000.0)) == 1
+    with pytest.raises(UserError, match=r"the time of a step is unknown: .*metrics.json is damaged \(metrics.timings"):
+        count_steps(job, ShortTrainings(job, timings="fast"))
+    assert count_steps(job, lambda arguments: False) is None
+    with pytest.raises(UserError, match=r"no metrics at .*metrics\.json"):
+        count_steps(job, lambda arguments: True)
+    assert not (Path(job.folder) / "speed").exists()
+
+
+@pytest.mark.parametrize(("step_s", "wanted"), [(0.05, [8, 120]), (0.2, [8, 120]), (0.5, [8, 48]), (1.2, [8, 18]), (3.0, [8])])
+def test_what_is_measured_takes_about_a_tenth_of_the_minutes(job, step_s, wanted):
+    trainings = ShortTrainings(job, step_s)
+    count_steps(job, trainings)
+    assert trainings.steps() == wanted
+    assert wanted[-1] * step_s <= 24.0
+    for call in trainings.calls:
+        assert call[: len(job.train)] == job.train
+        assert call[-1] == f"output_root='{job.folder}/speed'", "the last one counts"
+
+
+def test_a_second_short_training_that_fails_is_not_replaced_by_the_first(job):
+    trainings = ShortTrainings(job)
+    assert count_steps(job, lambda arguments: trainings(arguments) and len(trainings.calls) < 2) is None
 
 
 def test_the_commands_have_one_thread_and_the_steps_that_fit(job):
     assert [one for one in job.train if one.startswith("threads")] == ["threads=1"]
     assert "threads=2" in job.evaluations[0].arguments
     assert not [one for one in job.train if one.startswith("training.validate_every")], "that follows from the steps"
-    short = speed_arguments(job)
-    assert short[: len(job.train)] == job.train
-    assert short[-1] == f"output_root='{job.folder}/speed'", "the last one counts"
     curve = ("training.validate_every=40", "training.validation_frames=8")
     assert timed_arguments(job, 480) == (*job.train, "training.steps=480", *curve)
     assert "training.validate_every=1" in timed_arguments(job, 5)
@@ -78,10 +110,10 @@ class Commands:
 
     def __init__(self, job, **codes: int) -> None:
         self.job, self.codes, self.calls = job, codes, []
+        self.short = ShortTrainings(job)
 
     def __call__(self, arguments, log, stopped):
         is_short = f"output_root='{self.job.folder}/speed'" in arguments
-        assert not (is_short and (Path(self.job.folder) / "speed").exists()), "a short training begins anew"
         command = "speed" if is_short else next((a[6:] for a in arguments if a.startswith("split=")), arguments[0])
         self.calls.append((command, *[one for one in arguments if one.startswith("training.steps=")][-1:]))
         Path(log).write_text("busy\nsnarf train: the reason: what to do\n")
@@ -89,7 +121,7 @@ class Commands:
         if code == 130:
             raise JobStopped
         if code == 0 and is_short:
-            measured(self.job)
+            self.short(arguments)
         elif code == 0:
             fake_run(self.job, {"id": 0.9, "ood": 0.8})
         return code
@@ -99,7 +131,9 @@ def test_the_speed_is_measured_once(job):
     (Path(job.folder) / "speed/builtin").mkdir(parents=True)
     commands = Commands(job, train=130)
     status = run_job(job, runner=commands)
-    assert commands.calls == [("speed", "training.steps=120"), ("train", "training.steps=480")]
+    assert commands.calls == [
+        ("speed", "training.steps=8"), ("speed", "training.steps=48"), ("train", "training.steps=480"),
+    ]  # fmt: skip
     assert (status.state, status.stage, status.steps) == ("stopped", "train", 480)
     assert not (Path(job.folder) / "speed").exists()
     again = Commands(job)
@@ -109,7 +143,10 @@ def test_the_speed_is_measured_once(job):
     assert read(Path(job.folder) / STATUS)["steps"] == 480
     other = Commands(replace(job, digest="another"), train=2)
     assert run_job(other.job, runner=other).state == "failed"
-    assert [call[0] for call in other.calls] == ["speed", "train"], "measured again for other settings"
+    assert [call[0] for call in other.calls] == ["speed", "speed", "train"], "measured again for other settings"
+    write_json(Path(job.folder) / STATUS, read(Path(job.folder) / STATUS) | {"steps": 0})
+    damaged = Commands(other.job)
+    assert run_job(damaged.job, runner=damaged).steps == 480, "a number that cannot be is not kept"
 
 
 def test_a_speed_that_cannot_be_measured_is_a_failure(job):
@@ -150,8 +187,7 @@ def test_a_budget_and_a_number_of_steps_are_not_both_given(tmp_path):
 def test_a_real_training_of_a_budget(tmp_path, monkeypatch):
     """With the real commands, on a bending capsule: the speed, then as many steps as fit."""
     toy_store(tmp_path / "data", points=200, frames=8)
-    monkeypatch.setattr(speed, "_UNCOUNTED", 2)
-    monkeypatch.setattr(speed, "_STEPS", 6)
+    monkeypatch.setattr(speed, "_FIRST", speed._Probe(2, 6))
     extra = ("training.poses_per_step=1", "skinning.resolution=[8,8,8]", "shape.width=16", "skinning.bone_radius_m=0.3")
     options = ExperimentOptions(
         subjects=("toy",), training="smoke", systems=("ours-2",), extra=extra, data_root=str(tmp_path / "data"),

@@ -144,11 +144,12 @@ def test_interrupt_ends_the_step_and_leaves_a_checkpoint(store, tmp_path, number
     assert result["processor_s"] is None
 
 
-def test_the_processor_time_is_that_of_the_steps_of_all_parts(store, tmp_path, monkeypatch):
-    """Of a clock that a step moves by 3 s and a validation by 100 s."""
+@pytest.mark.parametrize("begin", [0, 2])
+def test_the_processor_time_is_that_of_the_steps_of_all_parts(store, tmp_path, monkeypatch, begin):
+    """Of a clock that a step moves by 3 s and a validation by 100 s. A checkpoint is written before a step's validation."""
     clock = [50.0]
     trainer = trainer_for(store, steps=4, validate_every=2)
-    trainer.processor_s = 1000.0
+    trainer.step, trainer.processor_s = begin, 1000.0
     advance, validate = trainer.advance, trainer.validate
 
     def moving(call, seconds):
@@ -158,7 +159,9 @@ def test_the_processor_time_is_that_of_the_steps_of_all_parts(store, tmp_path, m
     monkeypatch.setattr(loop.time, "process_time", lambda: clock[0])
     monkeypatch.setattr(trainer, "advance", lambda: moving(advance, 3.0))
     monkeypatch.setattr(trainer, "validate", lambda: moving(validate, 100.0))
-    assert train(trainer, tmp_path, on_scalars=lambda step, numbers: None)["processor_s"] == 1000.0 + 4 * 3.0
+    result = train(trainer, tmp_path, on_scalars=lambda step, numbers: None)
+    assert [one["step"] for one in trainer.validations] == [2, 4]
+    assert result["processor_s"] == 1000.0 + (4 - begin) * 3.0
 
 
 def test_learning_rate_warms_up_and_falls(store):

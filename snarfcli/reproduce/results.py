@@ -12,7 +12,7 @@ from typing import Any
 from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.files import read_json
-from snarfcli.reproduce.jobs import JobStatus, is_evaluated, read_status
+from snarfcli.reproduce.jobs import JobStatus, evaluations_to_make, is_evaluated, read_status
 from snarfcli.reproduce.plans import Job
 
 __all__ = [
@@ -225,7 +225,9 @@ def _state(status: JobStatus, job: Job, files: dict[str, Path]) -> tuple[str, st
     if status.state == "done" and "train" not in files:
         return "missing", f"{job.folder} has no avatar any more"
     if status.state == "done":
-        return "done", ""
+        left = [one.split for one in evaluations_to_make(job)]
+        why = "there is none of this avatar with these settings"
+        return ("missing", f"evaluation {' and '.join(left)}: {why}") if left else ("done", "")
     return "stopped", f"interrupted at {status.stage or 'the start'}"
 
 

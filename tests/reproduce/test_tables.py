@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
 import statistics
+from pathlib import Path
 
 import pytest
-from fake_runs import fake_plan, fake_run, read
+from fake_runs import fake_plan, fake_run, fake_samples, read
 
 from snarfcli.reproduce.jobs import STATUS
 from snarfcli.reproduce.papers import paper_numbers, paper_source
@@ -87,6 +89,9 @@ def test_only_numbers_of_the_same_settings_count(plan, tmp_path):
     other = fake_plan(tmp_path, subjects=("50002", "50004"), seeds=(0, 1, 2), systems=("snarf", "ours-local"), surface_frames=4)
     result = collect(other.jobs[0])
     assert result.files.keys() == {"train"}, "evaluated without surfaces, so it must be evaluated again"
+    reason = "evaluation id and ood: there is none of this avatar with these settings"
+    assert (result.state, result.reason) == ("missing", reason)
+    assert summarise([result], SURFACE).text(1) == "missing"
     status = read(tmp_path / "outputs/builtin/50002/snarf-quick-s0" / STATUS)
     assert status["digest"] == job.digest
     longer = fake_plan(tmp_path, systems=("snarf",), training="standard")
@@ -94,8 +99,24 @@ def test_only_numbers_of_the_same_settings_count(plan, tmp_path):
     assert longer.jobs[0].folder != job.folder
 
 
+def test_an_evaluation_that_is_older_than_its_avatar_is_missing(tmp_path):
+    plan = fake_plan(tmp_path, systems=("snarf",))
+    fake_run(plan.jobs[0], {"id": 0.9, "ood": 0.5})
+    os.utime(plan.jobs[0].evaluations[1].metrics, (1, 1))  # as after a copy that does not keep the times
+    result = collect(plan.jobs[0])
+    assert result.state == "missing"
+    assert result.reason.startswith("evaluation ood: ")
+    Path(plan.jobs[0].evaluations[1].metrics).unlink()
+    assert collect(plan.jobs[0]) == result
+    write_report(plan, [result], tmp_path / "report", "command")
+    text = (tmp_path / "report/table1.md").read_text()
+    assert "**Unfinished: 0 of 1 run done**" in text
+    assert "- SNARF, subject 50002, seed 0: missing: evaluation ood" in text
+
+
 def test_data_without_a_split_has_a_dash(tmp_path):
     plan = fake_plan(tmp_path, systems=("snarf",))
+    fake_samples(tmp_path / "data", "50002", ood=0)
     fake_run(plan.jobs[0], {"id": 0.9})
     result = collect(plan.jobs[0])
     assert result.state == "done"

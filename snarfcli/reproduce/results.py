@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import statistics
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -186,7 +186,9 @@ def collect(job: Job) -> Result:
     for evaluation in job.evaluations if "train" in files else ():
         if is_evaluated(evaluation, folder / "avatar.pt"):
             files[evaluation.split] = Path(evaluation.metrics)
-    known = {stage: _known(path) for stage, path in files.items()}
+    known = {stage: metrics for stage, path in files.items() if (metrics := _known(path)) is not None}
+    damaged = [str(path) for stage, path in files.items() if stage not in known]
+    files = {stage: files[stage] for stage in known}
     for column in (*COLUMNS, *MORE_COLUMNS):
         content = known[column.stage].content if column.stage in known else None
         value = None if content is None else _training_min(content) if not column.path else look_up(content, column.path)
@@ -194,7 +196,10 @@ def collect(job: Job) -> Result:
             values[column.key] = value * column.scale
     origins = {stage: replace(metrics, sequences={}, content={}) for stage, metrics in known.items()}
     times = (sum(one.values()) if one else None for one in (status.spent_s, status.processor_s))
-    return Result(job, *_state(status, job, files), values, files, origins, *times)
+    state = _state(status, job, files)
+    if damaged and status.state == "done":
+        state = "missing", f"damaged: {', '.join(damaged)}; delete it and run the command again"
+    return Result(job, *state, values, files, origins, *times)
 
 
 def summarise(results: Sequence[Result], column: Column) -> Cell:
@@ -246,12 +251,12 @@ def read_metrics(path: Path) -> Metrics:
     return replace(known, content=content)
 
 
-def _known(path: Path) -> Metrics:
-    """Return the numbers of a run; none if its file is damaged, so that the table shows the others."""
+def _known(path: Path) -> Metrics | None:
+    """Return the numbers of a run; None if its file is damaged, so that the table shows the others."""
     try:
         return read_metrics(path)
     except UserError:
-        return Metrics()
+        return None
 
 
 def look_up(content: Any, path: Sequence[str]) -> float | None:
@@ -259,7 +264,8 @@ def look_up(content: Any, path: Sequence[str]) -> float | None:
     for name in path:
         content = content.get(name) if isinstance(content, dict) else None
     is_number = isinstance(content, (int, float)) and not isinstance(content, bool)
-    return content if is_number and math.isfinite(content) else None
+    # The comparison also takes whole numbers that are too large for a float; it is false for NaN.
+    return content if is_number and abs(content) <= sys.float_info.max else None
 
 
 def _training_min(content: dict[str, Any]) -> float | None:

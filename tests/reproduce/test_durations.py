@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -118,6 +119,7 @@ def test_the_time_of_a_plan_is_that_of_its_busiest_process():
 
 
 def test_times_have_few_digits():
+    assert time_text(math.nan) == time_text(math.inf) == time_text(1e10), "from a damaged file"
     assert time_text(float("inf")).endswith(" min")
     assert [time_text(seconds) for seconds in (0.4, 40, 100, 5900, 6100)] == ["0 s", "40 s", "2 min", "98 min", "1 h 42 min"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import os
 import re
 import statistics
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 from fake_runs import fake_plan, fake_run, fake_samples, read
 
+from snarfcli.reproduce.durations import Durations
 from snarfcli.reproduce.jobs import STATUS
 from snarfcli.reproduce.papers import paper_numbers, paper_source
 from snarfcli.reproduce.report import write_report
@@ -112,6 +114,31 @@ def test_an_evaluation_that_is_older_than_its_avatar_is_missing(tmp_path):
     text = (tmp_path / "report/table1.md").read_text()
     assert "**Unfinished: 0 of 1 run done**" in text
     assert "- SNARF, subject 50002, seed 0: missing: evaluation ood" in text
+
+
+DAMAGED = ("{", "[]", '{"machine": 3}', '{"timings": {"seconds_per_step": NaN}}', '{"steps": 1' + 400 * "0" + "}")
+
+
+@pytest.mark.parametrize("content", DAMAGED, ids=lambda content: content[:40])
+@pytest.mark.parametrize("stage", ["train", "ood"])
+def test_a_damaged_file_of_one_run_leaves_the_others_in_the_report(tmp_path, content, stage):
+    plan = fake_plan(tmp_path, systems=("snarf",), seeds=(0, 1))
+    for job in plan.jobs:
+        fake_run(job, {"id": 0.9, "ood": 0.5})
+    evaluation = plan.jobs[0].evaluations[1]
+    path = Path(evaluation.metrics) if stage == "ood" else Path(plan.jobs[0].folder) / "metrics.json"
+    if stage == "ood" and content.startswith("{") and len(content) > 1:
+        content = content[:-1] + f', "settings": {json.dumps(evaluation.settings)}}}'  # so that it counts
+    path.write_text(content)
+    durations = Durations(tmp_path / "durations.json", plan.jobs, None, 1)
+    assert all(durations.of(job).total_s > 0 for job in plan.jobs)
+    results = [collect(job) for job in plan.jobs]
+    assert [result.state for result in results] == ["missing", "done"]
+    assert stage not in results[0].files
+    write_report(plan, results, tmp_path / "report", "command")
+    text = (tmp_path / "report/table1.md").read_text()
+    assert "**Unfinished: 1 of 2 runs done**" in text
+    assert "1 of 2: 50.0 (1 missing)" in text or stage == "train"
 
 
 def test_data_without_a_split_has_a_dash(tmp_path):

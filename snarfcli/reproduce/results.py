@@ -108,6 +108,8 @@ class Metrics:
     """Validations of a training, with the number of steps before each."""
     code: dict[str, Any] = field(default_factory=dict)
     """Version of the code; see `snarfcli.versions.recorded_code`."""
+    earlier_code: list[dict[str, Any]] = field(default_factory=list)
+    """Other versions that took the earlier steps of a training that was continued."""
     content: dict[str, Any] = field(default_factory=dict)
     """The whole file."""
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from snarfcli.reproduce.durations import time_text
 from snarfcli.reproduce.results import Metrics, Result
-from snarfcli.texts import counted, markdown_text, one_line
+from snarfcli.texts import counted, one_line, plain_markdown
 
 __all__ = ["code_versions", "cost_text", "machines", "provenance_lines", "provenance_sections"]
 
-_PLAIN = re.compile(r"[\w .,:;()@+/-]*")  # marks that mean nothing in Markdown
 _LONGEST = 80
 
 Origins = dict[str, list[str]]
@@ -93,7 +91,7 @@ def _grouped(results: Sequence[Result], keys: Callable[[Metrics], list[str]]) ->
                 stages.setdefault(text, []).append(stage)
         for text, some in stages.items():
             part = "" if len(stages) == 1 else f" ({', '.join(some)})"
-            found.setdefault(text, []).append(_plain(result.job.name) + part)
+            found.setdefault(text, []).append(plain_markdown(result.job.name) + part)
     return found
 
 
@@ -108,12 +106,6 @@ def _machine(origin: Metrics) -> str:
     return ", ".join(_text(str(part)) for part in parts if part) or "unknown machine"
 
 
-def _plain(text: str) -> str:
-    """Return a text for Markdown: as it is if nothing in it is mark-up."""
-    line = one_line(text)
-    return line if _PLAIN.fullmatch(line) else markdown_text(line)
-
-
 def _text(value: object) -> str:
     """Return a text of a file for Markdown; empty if it is none."""
-    return _plain(one_line(value, _LONGEST)) if isinstance(value, str) else ""
+    return plain_markdown(one_line(value, _LONGEST)) if isinstance(value, str) else ""

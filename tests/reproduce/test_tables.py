@@ -8,6 +8,7 @@ import json
 import os
 import re
 import statistics
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -139,6 +140,19 @@ def test_a_damaged_file_of_one_run_leaves_the_others_in_the_report(tmp_path, con
     text = (tmp_path / "report/table1.md").read_text()
     assert "**Unfinished: 1 of 2 runs done**" in text
     assert "1 of 2: 50.0 (1 missing)" in text or stage == "train"
+
+
+def test_names_and_reasons_are_no_mark_up(tmp_path):
+    plan = fake_plan(tmp_path, systems=("snarf",), seeds=(0, 1))
+    jobs = [replace(job, subject="a (1) b") for job in plan.jobs]
+    fake_run(jobs[0], {"id": 0.9, "ood": 0.5})
+    fake_run(jobs[1], {}, "failed", "no [x](http://x) <b>", trained=False)
+    write_report(plan, [collect(job) for job in jobs], tmp_path / "report", "command")
+    text = (tmp_path / "report/table1.md").read_text()
+    assert "[90.0](runs/a%20%281%29%20b/snarf-quick-s0/eval_id.json)" in text
+    assert (tmp_path / "report/runs/a (1) b/snarf-quick-s0/eval_id.json").is_file()
+    assert "<b>" not in text
+    assert "[x]" not in text
 
 
 def test_data_without_a_split_has_a_dash(tmp_path):

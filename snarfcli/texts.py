@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["counted", "markdown_text", "one_line", "terminal_text"]
+__all__ = ["counted", "markdown_text", "one_line", "plain_markdown", "terminal_text"]
 
 _LAYOUT = "\n\t"  # the only control characters that text on a terminal needs
+_PLAIN = re.compile(r"[\w .,:;()@+/-]*")  # marks that mean nothing in Markdown, within a line
 _MARKS = re.compile(r"[^\w ,]|_")  # everything but letters of any script, digits, spaces and commas
 
 
@@ -53,3 +54,9 @@ def markdown_text(text: object, longest: int = 200) -> str:
     line = one_line(str(text), longest)
     # As numbers of characters: a backslash would not stop MDX, nor keep an address from becoming a link.
     return _MARKS.sub(lambda mark: f"&#{ord(mark[0])};", line)
+
+
+def plain_markdown(text: str, longest: int = 500) -> str:
+    """Return a text as one line for Markdown: as it is if nothing in it is mark-up, else as `markdown_text` does."""
+    line = one_line(text, longest)
+    return line if _PLAIN.fullmatch(line) else markdown_text(line, longest)

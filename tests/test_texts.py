@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import re
 
-from snarfcli.texts import counted, markdown_text, one_line, terminal_text
+from snarfcli.texts import counted, markdown_text, one_line, plain_markdown, terminal_text
 
 HOSTILE = "a\x1b]0;title\x07\x1b[2J\r\u202eb\u2028\x9b31m\ud800"
 
@@ -40,3 +40,9 @@ def test_no_mark_up_is_left_in_text_for_a_page_and_its_characters_are_shown():
     assert re.fullmatch(r"(?:[^\W_]|[ ,]|&#\d+;)*", escaped)
     assert html.unescape(escaped) == one_line(attacks)
     assert len(html.unescape(markdown_text("_" * 10**6))) == 200
+
+
+def test_plain_markdown_stays_readable_unless_something_in_it_is_mark_up():
+    assert plain_markdown("train: loss is NaN (step 7)\n") == "train: loss is NaN (step 7)"
+    assert plain_markdown("a <b>") == "a &#60;b&#62;"
+    assert plain_markdown("x" * 9, 3) == "xxx"

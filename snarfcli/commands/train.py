@@ -236,6 +236,8 @@ def _metrics(config: TrainConfig, result: dict[str, Any], trainer: Trainer, seco
         "refined_poses": None if trainer.refiner is None else trainer.refiner.poses.summary(),
         "timings": {"wall_s": round(seconds, 2)} | {k: v for k, v in result.items() if k != "validation"},
         **machine_facts(trainer.device),
+        "code": trainer.code,
+        "earlier_code": trainer.earlier_code,
     }
 
 

@@ -224,7 +224,7 @@ def plan_seconds(seconds: Sequence[float], processes: int) -> float:
 
 def time_text(seconds: float) -> str:
     """Return a duration with the precision that an estimate has: 40 s, 12 min, 3 h 05 min."""
-    seconds = min(seconds, _LONGEST_S)
+    seconds = seconds if seconds < _LONGEST_S else _LONGEST_S  # also for NaN
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -53,19 +53,19 @@ class GrowingReports:
             if ended not in jobs:
                 continue
             results[ended] = collect(jobs[ended])
-            self._write(report, [_shown(results[folder], folder in running) for folder in jobs])
+            self._write(report, [_shown(results[folder], folder in running) for folder in jobs], is_growing=True)
 
     def stop(self) -> None:
         """Write the reports that were written before once more, after an interruption: nothing runs now."""
         for report in self.reports:
             if report.folder in self._begun:
-                self._write(report, [collect(job) for job in report.plan.jobs])
+                self._write(report, [collect(job) for job in report.plan.jobs], is_growing=False)
 
-    def _write(self, report: PlannedReport, results: Sequence[Result]) -> None:
+    def _write(self, report: PlannedReport, results: Sequence[Result], *, is_growing: bool) -> None:
         self._begun.add(report.folder)
         try:
             with hold_output(report.folder, "snarf reproduce"):
-                write_report(report.plan, results, report.folder, report.command, about=report.about, is_growing=True)
+                write_report(report.plan, results, report.folder, report.command, about=report.about, is_growing=is_growing)
         except (UserError, OSError) as error:  # such as another call that is drawing the figures, or a full disk
             if not self._has_failed:
                 log.warning("warning: the table of the runs so far was not written: %s", error)

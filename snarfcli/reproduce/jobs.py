@@ -26,6 +26,7 @@ __all__ = [
     "STATES",
     "STATUS",
     "JobStatus",
+    "evaluations_to_make",
     "is_evaluated",
     "read_job_status",
     "read_status",
@@ -143,6 +144,20 @@ def is_evaluated(evaluation: EvaluationStage, avatar: Path) -> bool:
         return False
     settings = content.get("settings") if isinstance(content, dict) else None
     return isinstance(settings, dict) and all(settings.get(key) == value for key, value in evaluation.settings.items())
+
+
+def evaluations_to_make(job: Job) -> list[EvaluationStage]:
+    """Return the evaluations of a trained run that do not count yet: missing ones, and those to be repeated.
+
+    Left out are missing ones of a split of which the samples are known to have no frames, or are not there.
+    """
+    avatar = Path(job.folder) / "avatar.pt"
+
+    def can_be_made(one: EvaluationStage) -> bool:
+        samples = samples_folder(one.data_root, one.data, job.subject)
+        return Path(one.metrics).is_file() or bool(_frames(samples, STORE_SPLITS[one.split]))
+
+    return [one for one in job.evaluations if not is_evaluated(one, avatar) and can_be_made(one)]
 
 
 class _Stages:

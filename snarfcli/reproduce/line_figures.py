@@ -80,8 +80,8 @@ def draw_training(plan: Plan, results: Sequence[Result], folder: Path) -> tuple[
 def training_curves(plan: Plan, results: Sequence[Result]) -> tuple[list[tuple[Row, Curve]], str]:
     """Return the rows all of whose runs have validations, with their curves, and the unit of the time.
 
-    The time is that of one core if all runs have recorded it, and the wall time otherwise. Runs of a row can differ in their
-    number of steps, so a mean is over validations after the same share of the steps.
+    The time is that of one core if all runs have recorded it and none used a GPU, and the wall time otherwise. Runs of a row
+    can differ in their number of steps, so a mean is over validations after the same share of the steps.
     """
     metrics: list[tuple[Row, list[Metrics]]] = []
     for row in plan.experiment.rows:
@@ -89,8 +89,9 @@ def training_curves(plan: Plan, results: Sequence[Result]) -> tuple[list[tuple[R
         known = [read_metrics(result.files["train"]) for result in of_row if "train" in result.files]
         if known and len(known) == len(of_row) and all(map(_is_measured, known)):
             metrics.append((row, known))
-    of_all = [one for _, some in metrics for run in some for one in run.validations]
-    clock = "processor_s" if all(look_up(one, ("processor_s",)) is not None for one in of_all) else "seconds"
+    runs = [run for _, some in metrics for run in some]
+    has_processor_s = all(look_up(one, ("processor_s",)) is not None for run in runs for one in run.validations)
+    clock = "processor_s" if has_processor_s and not any("gpu" in run.machine for run in runs) else "seconds"
     curves = [(row, _mean_curve(some, clock)) for row, some in metrics]
     return curves, "minutes of one core" if clock == "processor_s" else "minutes"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from snarfcli.progress import ProgressLines
 from snarfcli.reproduce.durations import Durations, plan_seconds, time_text
-from snarfcli.reproduce.jobs import LOG, JobStatus, is_evaluated, read_status
+from snarfcli.reproduce.jobs import LOG, JobStatus, evaluations_to_make, read_status
 from snarfcli.reproduce.plans import Job
 from snarfcli.reproduce.results import collect
 from snarfcli.texts import counted, one_line
@@ -73,15 +73,13 @@ def left_seconds(job: Job, durations: Durations) -> float:
     estimate, status = durations.of(job), read_status(Path(job.folder))
     if status is None or status.digest != job.digest:
         return estimate.total_s
-    if status.state in ("done", "diverged"):
+    if status.state == "diverged":
         return 0.0
     found = read_progress(Path(job.folder) / LOG)
     share = found.share if found is not None and found.stage in (None, status.stage) else 0.0
     if not status.trained:
         return estimate.train_s * (1 - share if status.stage == "train" else 1.0) + estimate.evaluations_s
-    avatar = Path(job.folder) / "avatar.pt"
-    left = [one.split for one in job.evaluations if not is_evaluated(one, avatar)]
-    parts = sum(1 - share if split == status.stage else 1.0 for split in left)
+    parts = sum(1 - share if one.split == status.stage else 1.0 for one in evaluations_to_make(job))
     return estimate.evaluations_s * parts / max(1, len(job.evaluations))
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from snarfcli.reproduce.durations import time_text
 from snarfcli.reproduce.results import Metrics, Result
-from snarfcli.texts import counted, markdown_text, one_line
+from snarfcli.texts import counted, one_line, plain_markdown
 
 __all__ = ["code_versions", "cost_text", "machines", "provenance_lines", "provenance_sections"]
 
-_PLAIN = re.compile(r"[\w .,:;()@+/-]*")  # marks that mean nothing in Markdown
 _LONGEST = 80
 
 Origins = dict[str, list[str]]
@@ -22,23 +21,23 @@ def code_versions(results: Sequence[Result]) -> Origins:
     """Return the runs of each version of the code; a version is what its files are, so two commits can be the same one."""
     commits: dict[str, list[str]] = {}
     for result in results:
-        for origin in result.origins.values():
-            digest, commit = _text(origin.code.get("digest")), _text(origin.code.get("commit"))
+        for code in (code for origin in result.origins.values() for code in _codes(origin)):
+            digest, commit = _text(code.get("digest")), _text(code.get("commit"))
             if commit and commit not in commits.setdefault(digest, []):
                 commits[digest].append(commit)
 
-    def version(origin: Metrics) -> str:
-        digest = _text(origin.code.get("digest"))
-        names = commits.get(digest, []) if digest else [_text(origin.code.get("commit"))]
+    def version(code: dict[str, Any]) -> str:
+        digest = _text(code.get("digest"))
+        names = commits.get(digest, []) if digest else [_text(code.get("commit"))]
         parts = [f"commit {' = '.join(names)}"] if any(names) else []
         return ", ".join([*parts, f"files {digest}"] if digest else parts) or "unknown version"
 
-    return _grouped(results, version)
+    return _grouped(results, lambda origin: [version(code) for code in _codes(origin)])
 
 
 def machines(results: Sequence[Result]) -> Origins:
     """Return the runs of each machine, with its number of threads and its version of PyTorch."""
-    return _grouped(results, _machine)
+    return _grouped(results, lambda origin: [_machine(origin)])
 
 
 def cost_text(results: Sequence[Result]) -> str:
@@ -78,15 +77,21 @@ def provenance_sections(results: Sequence[Result]) -> list[str]:
     ]
 
 
-def _grouped(results: Sequence[Result], key: Callable[[Metrics], str]) -> Origins:
+def _codes(origin: Metrics) -> list[dict[str, Any]]:
+    """Return the versions of the code that made a file; a training that was continued can have several."""
+    return [*origin.earlier_code, origin.code]
+
+
+def _grouped(results: Sequence[Result], keys: Callable[[Metrics], list[str]]) -> Origins:
     found: Origins = {}
     for result in results:
         stages: dict[str, list[str]] = {}
         for stage, origin in result.origins.items():
-            stages.setdefault(key(origin), []).append(stage)
+            for text in dict.fromkeys(keys(origin)):
+                stages.setdefault(text, []).append(stage)
         for text, some in stages.items():
             part = "" if len(stages) == 1 else f" ({', '.join(some)})"
-            found.setdefault(text, []).append(_plain(result.job.name) + part)
+            found.setdefault(text, []).append(plain_markdown(result.job.name) + part)
     return found
 
 
@@ -101,12 +106,6 @@ def _machine(origin: Metrics) -> str:
     return ", ".join(_text(str(part)) for part in parts if part) or "unknown machine"
 
 
-def _plain(text: str) -> str:
-    """Return a text for Markdown: as it is if nothing in it is mark-up."""
-    line = one_line(text)
-    return line if _PLAIN.fullmatch(line) else markdown_text(line)
-
-
 def _text(value: object) -> str:
     """Return a text of a file for Markdown; empty if it is none."""
-    return _plain(one_line(value, _LONGEST)) if isinstance(value, str) else ""
+    return plain_markdown(one_line(value, _LONGEST)) if isinstance(value, str) else ""

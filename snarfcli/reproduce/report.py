@@ -15,7 +15,7 @@ from snarfcli.reproduce.plans import Plan
 from snarfcli.reproduce.provenance import provenance_lines, provenance_sections
 from snarfcli.reproduce.results import COLUMNS, NOT_RUN, Result, read_metrics
 from snarfcli.reproduce.tables import csv_table, markdown_runs, markdown_table, more_columns, order_lines
-from snarfcli.texts import counted
+from snarfcli.texts import counted, plain_markdown
 
 __all__ = ["write_report"]
 
@@ -131,7 +131,8 @@ def _tables(plan: Plan, results: Sequence[Result], link: Any) -> str:
         sections.append(f"## Subject {subject}\n\n{markdown_table(plan, results, link, COLUMNS, subject)}")
     broken = [result for result in results if result.state != "done"]
     if broken:
-        told = [f"- {result.job.name}: {result.state}: {result.reason}" for result in broken if result.reason != NOT_RUN]
+        reasons = [f"{result.job.name}: {result.state}: {result.reason}" for result in broken if result.reason != NOT_RUN]
+        told = [f"- {plain_markdown(reason)}" for reason in reasons]  # their words are from files and logs
         others = len(broken) - len(told)
         told += [f"- {counted(others, 'run')}{' more' if told else ''}: {NOT_RUN}"] if others else []
         sections.append("## Not done\n\n" + "\n".join(told))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import statistics
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 from snarfcli.descriptions import DescriptionError, read_described
 from snarfcli.errors import UserError
 from snarfcli.files import read_json
-from snarfcli.reproduce.jobs import JobStatus, is_evaluated, read_status
+from snarfcli.reproduce.jobs import JobStatus, evaluations_to_make, is_evaluated, read_status
 from snarfcli.reproduce.plans import Job
 
 __all__ = [
@@ -108,6 +108,8 @@ class Metrics:
     """Validations of a training, with the number of steps before each."""
     code: dict[str, Any] = field(default_factory=dict)
     """Version of the code; see `snarfcli.versions.recorded_code`."""
+    earlier_code: list[dict[str, Any]] = field(default_factory=list)
+    """Other versions that took the earlier steps of a training that was continued."""
     content: dict[str, Any] = field(default_factory=dict)
     """The whole file."""
 
@@ -186,7 +188,9 @@ def collect(job: Job) -> Result:
     for evaluation in job.evaluations if "train" in files else ():
         if is_evaluated(evaluation, folder / "avatar.pt"):
             files[evaluation.split] = Path(evaluation.metrics)
-    known = {stage: _known(path) for stage, path in files.items()}
+    known = {stage: metrics for stage, path in files.items() if (metrics := _known(path)) is not None}
+    damaged = [str(path) for stage, path in files.items() if stage not in known]
+    files = {stage: files[stage] for stage in known}
     for column in (*COLUMNS, *MORE_COLUMNS):
         content = known[column.stage].content if column.stage in known else None
         value = None if content is None else _training_min(content) if not column.path else look_up(content, column.path)
@@ -194,7 +198,10 @@ def collect(job: Job) -> Result:
             values[column.key] = value * column.scale
     origins = {stage: replace(metrics, sequences={}, content={}) for stage, metrics in known.items()}
     times = (sum(one.values()) if one else None for one in (status.spent_s, status.processor_s))
-    return Result(job, *_state(status, job, files), values, files, origins, *times)
+    state = _state(status, job, files)
+    if damaged and status.state == "done":
+        state = "missing", f"damaged: {', '.join(damaged)}; delete it and run the command again"
+    return Result(job, *state, values, files, origins, *times)
 
 
 def summarise(results: Sequence[Result], column: Column) -> Cell:
@@ -225,7 +232,9 @@ def _state(status: JobStatus, job: Job, files: dict[str, Path]) -> tuple[str, st
     if status.state == "done" and "train" not in files:
         return "missing", f"{job.folder} has no avatar any more"
     if status.state == "done":
-        return "done", ""
+        left = [one.split for one in evaluations_to_make(job)]
+        why = "there is none of this avatar with these settings"
+        return ("missing", f"evaluation {' and '.join(left)}: {why}") if left else ("done", "")
     return "stopped", f"interrupted at {status.stage or 'the start'}"
 
 
@@ -244,12 +253,12 @@ def read_metrics(path: Path) -> Metrics:
     return replace(known, content=content)
 
 
-def _known(path: Path) -> Metrics:
-    """Return the numbers of a run; none if its file is damaged, so that the table shows the others."""
+def _known(path: Path) -> Metrics | None:
+    """Return the numbers of a run; None if its file is damaged, so that the table shows the others."""
     try:
         return read_metrics(path)
     except UserError:
-        return Metrics()
+        return None
 
 
 def look_up(content: Any, path: Sequence[str]) -> float | None:
@@ -257,7 +266,8 @@ def look_up(content: Any, path: Sequence[str]) -> float | None:
     for name in path:
         content = content.get(name) if isinstance(content, dict) else None
     is_number = isinstance(content, (int, float)) and not isinstance(content, bool)
-    return content if is_number and math.isfinite(content) else None
+    # The comparison also takes whole numbers that are too large for a float; it is false for NaN.
+    return content if is_number and abs(content) <= sys.float_info.max else None
 
 
 def _training_min(content: dict[str, Any]) -> float | None:

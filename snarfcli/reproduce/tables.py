@@ -6,6 +6,7 @@ import csv
 import io
 import itertools
 from collections.abc import Callable, Sequence
+from urllib.parse import quote
 
 from snarfcli.reproduce.experiments import Row
 from snarfcli.reproduce.papers import paper_numbers
@@ -151,7 +152,7 @@ def _linked(results: Sequence[Result], cell: Cell, column: Column, link: Link) -
         return text
     target = f"#{results[0].job.row}"
     if len(results) == 1:
-        target = link(results[0], column.stage) or target
+        target = quote(link(results[0], column.stage) or "") or target  # a subject can have spaces and brackets in its name
     return f"[{text}]({target})"
 
 

@@ -16,6 +16,7 @@ __all__ = [
     "CHECKPOINT_FORMAT",
     "CHECKPOINT_VERSION",
     "check_same_settings",
+    "checked_code",
     "checked_seconds",
     "checked_step",
     "checked_validations",
@@ -79,6 +80,15 @@ def checked_validations(validations: Any) -> list[dict[str, float]]:
         if not all(type(name) is str and _is_number(value) for name, value in one.items()):
             raise ValueError("validations: wanted finite numbers by name, got something else")
     return validations
+
+
+def checked_code(versions: Any) -> list[dict[str, str]]:
+    """Return the versions of the code in a checkpoint; ValueError if they are none."""
+    if not isinstance(versions, list) or not all(isinstance(one, dict) for one in versions):
+        raise ValueError("code: wanted a list of versions, got something else")
+    if not all(type(name) is str and type(value) is str for one in versions for name, value in one.items()):
+        raise ValueError("code: wanted texts by name, got something else")
+    return versions
 
 
 def _is_number(value: Any) -> bool:

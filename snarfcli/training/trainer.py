@@ -25,6 +25,7 @@ from snarfcli.training.checkpoints import (
     CHECKPOINT_FORMAT,
     CHECKPOINT_VERSION,
     check_same_settings,
+    checked_code,
     checked_seconds,
     checked_step,
     checked_validations,
@@ -37,6 +38,7 @@ from snarfcli.training.objective import Objective
 from snarfcli.training.optimizer import AveragedAdam
 from snarfcli.training.schedule import is_due, kind_of, learning_rate
 from snarfcli.training.settings import TrainingConfig
+from snarfcli.versions import recorded_code
 
 __all__ = ["CHECKPOINT_FORMAT", "CHECKPOINT_VERSION", "Diverged", "Trainer"]
 
@@ -99,6 +101,10 @@ class Trainer:
         """Processor time of the steps, of all threads and in all parts of the run; None if a part did not record it."""
         self.validations: list[dict[str, float]] = []
         """The validations so far: `step`, `seconds` and `processor_s` of training, and the numbers of `validate`."""
+        self.code = recorded_code()  # now, since the files can change while the training runs
+        """Version of the code."""
+        self.earlier_code: list[dict[str, str]] = []
+        """Other versions of the code that took earlier steps; empty ones did not record what they are."""
 
     def advance(self) -> StepNumbers:
         """Take one step, or start it on a device, and return its losses and counts, which are read when they are asked for.
@@ -263,6 +269,7 @@ class Trainer:
             "seconds": self.seconds,
             "processor_s": self.processor_s,
             "validations": self.validations,
+            "code": [*self.earlier_code, self.code],
             "seed": self.seed,
             "avatar": self.avatar.to_dict(),
             "training": asdict(self.config),
@@ -291,6 +298,8 @@ class Trainer:
             processor_s = state.get("processor_s")
             self.processor_s = None if processor_s is None else checked_seconds(processor_s)
             self.validations = checked_validations(state.get("validations", []))
+            known = checked_code(state.get("code", [{}]))
+            self.earlier_code = [one for one in known if one.get("digest") != self.code["digest"]]
             if state.get("draws_on_device", self._ahead is not None) != (self._ahead is not None):
                 log.info("other random numbers than before from here on: training.graph or the device has changed")
         except (LookupError, RuntimeError, TypeError, ValueError, AttributeError) as error:

@@ -72,6 +72,8 @@ def test_the_run_folder_holds_all_that_a_run_should(config, caplog):
     assert 0 <= metrics["iou_surface"] <= 1
     assert metrics["timings"]["points_per_second"] > 0
     assert metrics["timings"]["processor_s"] > 0
+    assert len(metrics["code"]["digest"]) == 12
+    assert metrics["earlier_code"] == []
     assert {"versions", "machine"} <= set(metrics)
     assert "steps: 6" in (folder / "config.yaml").read_text()
     assert Avatar.load(folder / "avatar.pt").facts["steps"] == 6

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from fake_runs import FAKE_MACHINE, fake_plan, fake_run, read
@@ -56,7 +58,8 @@ def test_other_settings_and_other_machines_do_not_count(plan, tmp_path):
     fake_run(job_of(plan, "nasa"), {"id": 0.9, "ood": 0.8}, spent_s={"train": 300.0, "id": 30.0, "ood": 10.0})
     assert durations_of(plan, tmp_path, "another processor, 64 cores").of(job_of(plan, "nasa")).source == "hint"
     assert durations_of(plan, tmp_path, None).of(job_of(plan, "nasa")).source == "runs", "a cluster has many machines"
-    for change in ({"extra": ("training.steps=7",)}, {"training": "standard"}, {"max_frames": 3}):
+    changes: list[dict[str, Any]] = [{"extra": ("training.steps=7",)}, {"training": "standard"}, {"max_frames": 3}]
+    for change in changes:
         other = fake_plan(tmp_path, systems=("nasa",), **change)
         assert other.jobs[0].kind != job_of(plan, "nasa").kind, change
     same = fake_plan(tmp_path, systems=("nasa",), seeds=(9,), threads=2, device="cpu").jobs[0]
@@ -118,6 +121,7 @@ def test_the_time_of_a_plan_is_that_of_its_busiest_process():
 
 
 def test_times_have_few_digits():
+    assert time_text(math.nan) == time_text(math.inf) == time_text(1e10), "from a damaged file"
     assert time_text(float("inf")).endswith(" min")
     assert [time_text(seconds) for seconds in (0.4, 40, 100, 5900, 6100)] == ["0 s", "40 s", "2 min", "98 min", "1 h 42 min"]
 

@@ -34,7 +34,9 @@ def test_a_report_grows_with_its_runs(tmp_path, caplog):
     assert "running: not finished yet" in page.read_text()
     fake_run(plan.jobs[2], {}, "stopped", trained=False)
     growing.stop()
-    assert "- NASA, subject 50002, seed 1: stopped: interrupted at train\n" in page.read_text()
+    text = page.read_text()
+    assert "- NASA, subject 50002, seed 1: stopped: interrupted at train\n" in text
+    assert "**Unfinished: 2 of 4 runs done**; the section Not done says why." in text, "nothing runs that would write it again"
     GrowingReports([PlannedReport(plan, tmp_path / "not begun", "snarf reproduce table1")]).stop()
     assert not (tmp_path / "not begun").exists()
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_runs import fake_plan, fake_run, read
+from fake_runs import FAKE_MACHINE, fake_plan, fake_run, read
 from PIL import Image
 
 from snarfcli.files import write_json
@@ -62,6 +62,18 @@ def test_rows_without_all_runs_are_left_out_and_the_wall_time_counts_if_one_has_
     for _, curve in curves:
         np.testing.assert_allclose(curve.minutes, [1, 2])
         assert set(curve.iou) == {"in"}, "not measured out of distribution"
+
+
+def test_on_a_gpu_the_wall_time_counts(tmp_path):
+    plan = fake_plan(tmp_path, systems=("nasa", "snarf"))
+    for job in plan.jobs:
+        validated(job, [10, 20], [60, 120], [0.5, 0.7])
+    path = Path(plan.jobs[1].folder) / "metrics.json"
+    write_json(path, read(path) | {"machine": FAKE_MACHINE | {"gpu": "a GPU"}})
+    curves, clock = training_curves(plan, [collect(job) for job in plan.jobs])
+    assert clock == "minutes"
+    for _, curve in curves:
+        np.testing.assert_allclose(curve.minutes, [1, 2])
 
 
 def test_damaged_or_missing_validations_draw_nothing(tmp_path):

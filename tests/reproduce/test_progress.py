@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import random
 from pathlib import Path
 
@@ -81,6 +82,8 @@ def test_what_a_run_still_takes_follows_its_stage(plan, tmp_path):
     fake_run(first, {"id": 0.9, "ood": 0.8}, spent_s={"train": 100.0, "id": 10.0, "ood": 10.0})
     known = durations_of(plan, tmp_path)
     assert left_seconds(first, known) == 0
+    os.utime(first.evaluations[0].metrics, (1, 1))
+    assert left_seconds(first, known) == 10, "an evaluation older than the avatar is made again"
     assert left_seconds(second, known) == 120
     write_status(second, "stopped", "train", TRAIN + STEPS)
     assert left_seconds(second, known) == 95

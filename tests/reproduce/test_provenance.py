@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
-from fake_runs import FAKE_MACHINE, fake_metrics, fake_plan, fake_run
+from fake_runs import FAKE_MACHINE, fake_metrics, fake_plan, fake_run, read
 
 from snarfcli.files import write_json
 from snarfcli.reproduce.provenance import code_versions, cost_text, machines
@@ -57,6 +59,20 @@ def test_several_versions_are_listed_with_their_runs(plan, tmp_path):
     text = text_of(plan, tmp_path / "report")
     assert "- code: **3 versions**, listed at the end of the page\n" in text
     assert "## Versions of the code\n\n- commit 0123456789, files aaaaaaaaaaaa: NASA, subject 50002, seed 0; SNARF," in text
+
+
+def test_a_training_that_another_version_continued_counts_for_both(plan):
+    for job in plan.jobs:
+        fake_run(job, VALUES, code=NEW)
+    metrics = Path(plan.jobs[0].folder) / "metrics.json"
+    write_json(metrics, read(metrics) | {"earlier_code": [OLD, {}]})
+    found = code_versions(collected(plan))
+    others = [job.name for job in plan.jobs[1:]]
+    assert found == {
+        "commit 0123456789, files aaaaaaaaaaaa": ["NASA, subject 50002, seed 0 (train)"],
+        "unknown version": ["NASA, subject 50002, seed 0 (train)"],
+        "commit abcdef0123-dirty, files bbbbbbbbbbbb": ["NASA, subject 50002, seed 0 (train, id, ood)", *others],
+    }
 
 
 def test_versions_are_told_apart_by_their_files(plan):

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
+import json
+import os
 import re
 import statistics
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
-from fake_runs import fake_plan, fake_run, read
+from fake_runs import fake_plan, fake_run, fake_samples, read
 
+from snarfcli.reproduce.durations import Durations
 from snarfcli.reproduce.jobs import STATUS
 from snarfcli.reproduce.papers import paper_numbers, paper_source
 from snarfcli.reproduce.report import write_report
@@ -87,6 +92,9 @@ def test_only_numbers_of_the_same_settings_count(plan, tmp_path):
     other = fake_plan(tmp_path, subjects=("50002", "50004"), seeds=(0, 1, 2), systems=("snarf", "ours-local"), surface_frames=4)
     result = collect(other.jobs[0])
     assert result.files.keys() == {"train"}, "evaluated without surfaces, so it must be evaluated again"
+    reason = "evaluation id and ood: there is none of this avatar with these settings"
+    assert (result.state, result.reason) == ("missing", reason)
+    assert summarise([result], SURFACE).text(1) == "missing"
     status = read(tmp_path / "outputs/builtin/50002/snarf-quick-s0" / STATUS)
     assert status["digest"] == job.digest
     longer = fake_plan(tmp_path, systems=("snarf",), training="standard")
@@ -94,8 +102,62 @@ def test_only_numbers_of_the_same_settings_count(plan, tmp_path):
     assert longer.jobs[0].folder != job.folder
 
 
+def test_an_evaluation_that_is_older_than_its_avatar_is_missing(tmp_path):
+    plan = fake_plan(tmp_path, systems=("snarf",))
+    fake_run(plan.jobs[0], {"id": 0.9, "ood": 0.5})
+    os.utime(plan.jobs[0].evaluations[1].metrics, (1, 1))  # as after a copy that does not keep the times
+    result = collect(plan.jobs[0])
+    assert result.state == "missing"
+    assert result.reason.startswith("evaluation ood: ")
+    Path(plan.jobs[0].evaluations[1].metrics).unlink()
+    assert collect(plan.jobs[0]) == result
+    write_report(plan, [result], tmp_path / "report", "command")
+    text = (tmp_path / "report/table1.md").read_text()
+    assert "**Unfinished: 0 of 1 run done**" in text
+    assert "- SNARF, subject 50002, seed 0: missing: evaluation ood" in text
+
+
+DAMAGED = ("{", "[]", '{"machine": 3}', '{"timings": {"seconds_per_step": NaN}}', '{"steps": 1' + 400 * "0" + "}")
+
+
+@pytest.mark.parametrize("content", DAMAGED, ids=lambda content: content[:40])
+@pytest.mark.parametrize("stage", ["train", "ood"])
+def test_a_damaged_file_of_one_run_leaves_the_others_in_the_report(tmp_path, content, stage):
+    plan = fake_plan(tmp_path, systems=("snarf",), seeds=(0, 1))
+    for job in plan.jobs:
+        fake_run(job, {"id": 0.9, "ood": 0.5})
+    evaluation = plan.jobs[0].evaluations[1]
+    path = Path(evaluation.metrics) if stage == "ood" else Path(plan.jobs[0].folder) / "metrics.json"
+    if stage == "ood" and content.startswith("{") and len(content) > 1:
+        content = content[:-1] + f', "settings": {json.dumps(evaluation.settings)}}}'  # so that it counts
+    path.write_text(content)
+    durations = Durations(tmp_path / "durations.json", plan.jobs, None, 1)
+    assert all(durations.of(job).total_s > 0 for job in plan.jobs)
+    results = [collect(job) for job in plan.jobs]
+    assert [result.state for result in results] == ["missing", "done"]
+    assert stage not in results[0].files
+    write_report(plan, results, tmp_path / "report", "command")
+    text = (tmp_path / "report/table1.md").read_text()
+    assert "**Unfinished: 1 of 2 runs done**" in text
+    assert "1 of 2: 50.0 (1 missing)" in text or stage == "train"
+
+
+def test_names_and_reasons_are_no_mark_up(tmp_path):
+    plan = fake_plan(tmp_path, systems=("snarf",), seeds=(0, 1))
+    jobs = [replace(job, subject="a (1) b") for job in plan.jobs]
+    fake_run(jobs[0], {"id": 0.9, "ood": 0.5})
+    fake_run(jobs[1], {}, "failed", "no [x](http://x) <b>", trained=False)
+    write_report(plan, [collect(job) for job in jobs], tmp_path / "report", "command")
+    text = (tmp_path / "report/table1.md").read_text()
+    assert "[90.0](runs/a%20%281%29%20b/snarf-quick-s0/eval_id.json)" in text
+    assert (tmp_path / "report/runs/a (1) b/snarf-quick-s0/eval_id.json").is_file()
+    assert "<b>" not in text
+    assert "[x]" not in text
+
+
 def test_data_without_a_split_has_a_dash(tmp_path):
     plan = fake_plan(tmp_path, systems=("snarf",))
+    fake_samples(tmp_path / "data", "50002", ood=0)
     fake_run(plan.jobs[0], {"id": 0.9})
     result = collect(plan.jobs[0])
     assert result.state == "done"

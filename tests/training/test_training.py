@@ -144,6 +144,24 @@ def test_interrupt_ends_the_step_and_leaves_a_checkpoint(store, tmp_path, number
     assert result["processor_s"] is None
 
 
+def test_a_checkpoint_knows_the_versions_of_the_code_that_took_its_steps(store):
+    trainer = trainer_for(store)
+    trainer.code = {"digest": "aaaaaaaaaaaa", "commit": "0123456789"}
+    again = trainer_for(store)
+    again.restore(trainer.state(), "checkpoint.pt")
+    assert again.earlier_code == [trainer.code]
+    assert again.state()["code"] == [trainer.code, again.code]
+    same = trainer_for(store)
+    same.restore(again.state(), "checkpoint.pt")
+    assert same.earlier_code == [trainer.code]
+    unknown = {name: value for name, value in trainer.state().items() if name != "code"}
+    again.restore(unknown, "checkpoint.pt")
+    assert again.earlier_code == [{}]
+    for damaged in ("x", [3], [{"digest": 3}], [{3: "x"}]):
+        with pytest.raises(UserError, match="does not fit this version"):
+            again.restore(unknown | {"code": damaged}, "checkpoint.pt")
+
+
 @pytest.mark.parametrize("begin", [0, 2])
 def test_the_processor_time_is_that_of_the_steps_of_all_parts(store, tmp_path, monkeypatch, begin):
     """Of a clock that a step moves by 3 s and a validation by 100 s. A checkpoint is written before a step's validation."""

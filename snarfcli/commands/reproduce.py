@@ -159,7 +159,8 @@ def _run_jobs(
     except KeyboardInterrupt:
         progress.close()
         growing.stop()
-        log.info("stopped with %d of %s done; run the same command to continue", progress.done, counted(len(jobs), "run"))
+        runs = counted(len(jobs), "run")
+        log.info("stopped with %d of %s done; run the same command to continue from the last checkpoints", progress.done, runs)
         raise
     finally:
         progress.close()

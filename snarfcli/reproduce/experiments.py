@@ -29,6 +29,8 @@ class Row:
     """Budget of the training in minutes of one core, from which its number of steps follows; None: the steps of the preset."""
     is_optional: bool = False
     """Whether the row is only in the table if `systems=` names it."""
+    note: str = ""
+    """Note for the reader of a report with this row."""
     cost: float = 2.0
     """Rough processor time of one run with training=quick, minutes: orders the runs before anything is measured."""
 
@@ -56,7 +58,7 @@ class Experiment:
     order: tuple[str, ...] = ()
     """Keys of rows from the best to the worst out of distribution, as the papers report."""
     notes: tuple[str, ...] = ()
-    """Notes for the reader of the report."""
+    """Notes for the reader of the report; those of its rows follow."""
 
 
 _DFAUST = ("50002", "50004", "50007", "50009", "50020", "50021", "50022", "50025", "50026", "50027")
@@ -76,10 +78,15 @@ _POSE_ONET = Row("pose_onet", "Pose-ONet", ("model=pose_onet", *_PAPERS), _NETWO
 _BACK_D = Row("back_d", "Back-D", ("model=back_d", *_PAPERS), _NETWORKS, "back_d", cost=4.0)
 # In the papers its weights have no prior; our presets start from the distances to the bones, which makes another system.
 _NO_PRIOR = "skinning.prior_falloff_m=null"
-_BACK_LBS = Row("back_lbs", "Back-LBS", ("model=back_lbs", _NO_PRIOR, *_PAPERS), _NETWORKS, "back_lbs", cost=3.6)
+_BACK_LBS = Row(
+    "back_lbs", "Back-LBS", ("model=back_lbs", _NO_PRIOR, *_PAPERS), _NETWORKS, "back_lbs", cost=3.6,
+    note="Back-LBS learns its weights without a prior, as in the papers.",
+)  # fmt: skip
 _BACK_LBS_PRIOR = Row(
-    "back_lbs-prior", "Back-LBS, weights start from the bones", ("model=back_lbs", *_PAPERS), _NETWORKS, cost=4.0
-)
+    "back_lbs-prior", "Back-LBS, weights start from the bones", ("model=back_lbs", *_PAPERS), _NETWORKS, cost=4.0,
+    note="Back-LBS, weights start from the bones: from the distances to the posed bones, as ours start from the distances to "
+    "the canonical bones.",
+)  # fmt: skip
 _NASA = Row("nasa", "NASA", ("model=nasa", *_PAPERS), _NETWORKS, "nasa", cost=7.5)
 # A step of the presets takes 12 s on one core, 150 times as long as for Fast-SNARF. With nine start bones (as in the released
 # code) and an eighth of the points it takes 0.4 s.
@@ -87,24 +94,25 @@ _SNARF_LIGHT = (
     *_NETWORKS, "search=broyden", "training.poses_per_step=2", "training.uniform_points=150", "training.surface_points=450",
     "training.far_points=50", "training.validate_every=600",
 )  # fmt: skip
-_SNARF = Row("snarf", "SNARF", ("model=snarf", *_PAPERS), _SNARF_LIGHT, "snarf", cost=24.0)
-_SNARF_NOTE = (
-    "With all presets except paper, SNARF searches from nine bones and uses an eighth of the points per step; the times of "
-    "its rows are for these settings."
-)
+_SNARF = Row(
+    "snarf", "SNARF", ("model=snarf", *_PAPERS), _SNARF_LIGHT, "snarf", cost=24.0,
+    note="With all presets except paper, SNARF searches from nine bones and uses an eighth of the points per step; the times "
+    "of its row are for these settings.",
+)  # fmt: skip
 # As near to its own settings as an hour of one core allows with the 1,200 steps of training=quick, 2.7 s each: its search from
 # all 24 bones with at most 20 steps (conf/search/snarf.yaml), and 3,040 instead of 18,000 points, from 4 instead of 8 poses.
 _SNARF_HOUR = Row(
     "snarf-hour", "SNARF, search from all bones", ("model=snarf", *_PAPERS),
     (*_NETWORKS, "search=snarf", "training.poses_per_step=4", "training.uniform_points=180", "training.surface_points=540",
      "training.far_points=40"), "snarf", cost=54.0, is_optional=True,
+    note="SNARF, search from all bones: as near to its own settings as an hour of one core allows with training=quick, with a "
+    "sixth of its points per step, from half as many poses.",
 )  # fmt: skip
-_SNARF_HOUR_NOTE = (
-    "systems=[snarf-hour,...] has SNARF as near to its own settings as an hour of one core allows with training=quick: its "
-    "search from all bones, with a sixth of its points per step, from half as many poses."
-)
 _NETWORKS_COST = 4.6  # of our kind of search with networks
-_FAST_SNARF = Row("fast_snarf-broyden", "Fast-SNARF", _BROYDEN, _NETWORKS, "fast_snarf", cost=_NETWORKS_COST)
+_FAST_SNARF = Row(
+    "fast_snarf-broyden", "Fast-SNARF", _BROYDEN, _NETWORKS, "fast_snarf", cost=_NETWORKS_COST,
+    note="Fast-SNARF uses the paper's search (nine bones, Broyden's Jacobian).",
+)  # fmt: skip
 _GLOBAL = Row("ours-global", "ours, condition=global", (*_OURS, "condition=global"))
 _LOCAL = Row("ours-local", "ours, condition=local", (*_OURS, "condition=local"))
 _NONE = Row("ours-none", "ours, condition=none", (*_OURS, "condition=none"))
@@ -131,11 +139,6 @@ _TABLE1 = Experiment(
     notes=(
         "The papers' systems have networks (shape=small skinning=coarse) with every preset except paper; ours have what the "
         "preset says: feature grids and weights at the nodes in quick and standard.",
-        "Fast-SNARF uses the paper's search (nine bones, Broyden's Jacobian).",
-        _SNARF_NOTE,
-        _SNARF_HOUR_NOTE,
-        "Back-LBS learns its weights without a prior, as in the papers; in the row below they start from the distances to the "
-        "posed bones, as ours start from the distances to the canonical bones.",
     ),
 )
 
@@ -156,7 +159,7 @@ _TABLE2 = Experiment(
     ),
     _BODIES,
     _BODY_SUBJECTS,
-    notes=("All search from nine bones by Broyden's method, as in the paper.", _SNARF_NOTE),
+    notes=("All search from nine bones by Broyden's method, as in the paper.",),
 )  # fmt: skip
 
 _RECIPE = (
@@ -237,6 +240,12 @@ _MINUTES = Experiment(
     ),
 )
 
+_RIGID_NOTE = (
+    "Piecewise (rigid): rigid parts cannot follow this stick. With inverse distances to the bones as weights, a bend moves a "
+    "point sideways by its distance from the axis times the sine of the angle, however far from the joint. The best rigid "
+    "parts, found without a network, are about as good as the trained ones; with inverse squared distances, rigid parts are "
+    "much better (benchmarks/bm_rigid_pieces.py)."
+)
 # S Sec. 4.3: "we do not use local pose-conditioning as the shape does not locally deform with pose". Pose-ONet and the weights
 # of Back-LBS depend on the pose nevertheless.
 _STICK2D = Experiment(
@@ -246,7 +255,7 @@ _STICK2D = Experiment(
         Row("ours-none", "forward skinning (ours)", (*_OURS, "condition=none"), cost=0.8),
         Row("back_lbs", "Back-LBS", ("model=back_lbs", "condition=none"), cost=0.5),
         Row("pose_onet", "Pose-ONet", ("model=pose_onet", "condition=none"), cost=0.2),
-        Row("piecewise", "Piecewise (rigid)", ("model=piecewise", "condition=none"), cost=0.5),
+        Row("piecewise", "Piecewise (rigid)", ("model=piecewise", "condition=none"), cost=0.5, note=_RIGID_NOTE),
         Row("piecewise-deforming", "Piecewise (deforming)", ("model=nasa", "condition=none"), cost=0.5),
     ),
     ("stick2d",),
@@ -256,10 +265,6 @@ _STICK2D = Experiment(
     notes=(
         "stick: two bones; stick_object: two bones, a rigid object; stick_stepN: two bones, training angles N degrees apart.",
         "In distribution: angles as in training; out of distribution: larger angles.",
-        "Rigid parts cannot follow this stick. With inverse distances to the bones as weights, a bend moves a point sideways "
-        "by its distance from the axis times the sine of the angle, however far from the joint. The best rigid parts, found "
-        "without a network, are about as good as the trained ones; with inverse squared distances, rigid parts are much "
-        "better (benchmarks/bm_rigid_pieces.py).",
         "The paper's text gives no numbers for Piecewise. It says piecewise rigid, but also a variant of NASA, whose parts "
         "deform with the pose: both are here.",
     ),
@@ -270,12 +275,12 @@ _CLOTHED = Experiment(
     "clothed",
     "Clothed humans (SNARF Sec. 4.5, Fast-SNARF Sec. 5.2)",
     tuple(
-        Row(row.key, row.label, (*_CLOTHED_SETTINGS, *row.overrides), row.light, cost=row.cost)
+        Row(row.key, row.label, (*_CLOTHED_SETTINGS, *row.overrides), row.light, cost=row.cost, note=row.note)
         for row in (Row("smpl_nn", "SMPL NN", ("model=smpl_nn", *_PAPERS)), _SNARF, _FAST_SNARF, _GLOBAL, _LOCAL)
     ),
     ("clothed", "cape"),
     {"clothed": ("50002", "50004")},
-    notes=("The papers show pictures of this experiment, but no numbers.", _SNARF_NOTE),
+    notes=("The papers show pictures of this experiment, but no numbers.",),
 )
 
 EXPERIMENTS = {experiment.name: experiment for experiment in (_TABLE1, _TABLE2, _ABLATIONS, _MINUTES, _STICK2D, _CLOTHED)}

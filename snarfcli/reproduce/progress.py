@@ -154,8 +154,8 @@ class PlanProgress:
         far = ""
         if found is not None and found.stage in (None, stage):
             far = f"{100 * found.share:3.0f} %, {found.done} of {found.total} {found.unit}"
-        minutes = time_text(time.monotonic() - self.running[number])
-        return f"  {_TITLES.get(stage, stage or 'start'):8}  {far:26}  {minutes:>8}  {job.name}"
+        since = f"for {time_text(time.monotonic() - self.running[number])}"
+        return f"  {_TITLES.get(stage, stage or 'start'):8}  {far:26}  {since:>12}  {job.name}"
 
     def _outcome(self, job: Job, status: JobStatus) -> str:
         if status.state != "done":

@@ -88,7 +88,7 @@ def _head(plan: Plan, results: Sequence[Result], command: str, about: str, is_gr
         f"- data {plan.data}, subjects {', '.join(plan.subjects)}, seeds {', '.join(map(str, plan.seeds))}",
         f"- training={plan.training}: {settings}{extra}; differences of single rows are in the `config.yaml` of their runs",
     ]
-    lines += [f"- {note}" for note in experiment.notes]
+    lines += [f"- {note}" for note in (*experiment.notes, *(row.note for row in experiment.rows if row.note))]
     source = paper_source(experiment.name)
     if source and plan.data != "dfaust":
         lines.append(f"- the papers' numbers ({source}) are for DFaust, PosePrior and a GPU; compare the order, not the values")

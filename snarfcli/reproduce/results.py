@@ -67,7 +67,7 @@ COLUMNS = (
     Column("total_ms", "total ms", f"total: {_TIMES}", "id", ("timings", "total_ms_per_200k")),
     Column("training_min", "training min", "number of steps times the time per step, without validation, minutes", "train", ()),
     Column("core_min", "core min", "processor time of the steps, all threads, without validation, minutes; other work on the "
-           "machine changes it less than the time", "train", ("timings", "processor_s"), 1 / 60),
+           "machine changes it less than the time", "train", ("timings", "processor_s"), 1 / 60, 2),
 )  # fmt: skip
 """The columns of every table."""
 

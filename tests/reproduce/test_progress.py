@@ -109,8 +109,8 @@ def test_progress_is_shown_in_lines_and_runs_that_end_give_better_estimates(plan
     shown.look()
     (block,) = [record.message for record in caplog.records if "0 of 4 runs done, 2 running; about " in record.message]
     _, nasa, snarf = block.splitlines()
-    assert " ".join(nasa.split()) == "train 2 min NASA, subject 50002, seed 0"
-    assert " ".join(snarf.split()) == "train 25 %, 300 of 1200 steps 2 min SNARF, subject 50002, seed 0"
+    assert " ".join(nasa.split()) == "train for 2 min NASA, subject 50002, seed 0"
+    assert " ".join(snarf.split()) == "train 25 %, 300 of 1200 steps for 2 min SNARF, subject 50002, seed 0"
 
     times = {"train": 200.0, "id": 20.0, "ood": 20.0}
     values = {"id": 0.9, "ood": 0.8, "step_s": 0.1}

@@ -198,7 +198,7 @@ def test_ctrl_c_leaves_a_table_of_the_runs_so_far(tmp_path, monkeypatch, caplog)
     monkeypatch.setattr(reproduce, "launch", launch)
     with pytest.raises(KeyboardInterrupt):
         run(config)
-    assert "stopped with 1 of 2 runs done; run the same command to continue" in caplog.text
+    assert "stopped with 1 of 2 runs done; run the same command to continue from the last checkpoints" in caplog.text
     text = (tmp_path / "outputs/reproduce/table1/table1.md").read_text()
     assert "**Unfinished: 1 of 2 runs done**" in text
     assert "- Back-D, subject toy, seed 0: stopped: interrupted at train" in text, "not as if it still ran"

@@ -75,6 +75,7 @@ for path in sorted(folder.rglob("*.py")):
     assert done.returncode == 0, done.stderr
     rooms = {
         "avatar",
+        "cli",
         "commands",
         "datasets",
         "evaluation",

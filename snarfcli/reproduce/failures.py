@@ -17,10 +17,10 @@ AGAIN = "again"
 ALONE = "alone"
 """There was not enough memory; there may be when no other run works."""
 
-# Signals that nobody sends on purpose, except SIGKILL, which the system sends when memory runs out.
+# Signals of crashes, and SIGKILL, which the system sends when memory runs out.
 _SIGNALS = {"SIGKILL": ALONE, "SIGBUS": AGAIN, "SIGSEGV": AGAIN, "SIGABRT": AGAIN}
 # Words of the commands' own messages (`cli.messages`, `errors`, `parallel`). A full disk, a wrong setting and damaged data stay
-# as they are until somebody does something.
+# as they are until the user changes something.
 _MEMORY = re.compile(r"(?:not enough|out of|more) memory|memory ran out")
 _DRIVE = re.compile(r"network drive|disk reports an error")
 _USER_ERROR = 2
@@ -56,7 +56,7 @@ def retry_of(code: int, reason: str) -> str:
     """
     if code < 0:
         return _SIGNALS.get(_signal_name(code), "")
-    if code != _USER_ERROR:  # a fault of the program, or somebody has asked it to end
+    if code != _USER_ERROR:  # a fault of the program, or a request to end
         return ""
     return ALONE if _MEMORY.search(reason) else AGAIN if _DRIVE.search(reason) else ""
 

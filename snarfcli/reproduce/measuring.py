@@ -29,7 +29,7 @@ __all__ = ["Measurements"]
 _TRAINING_S = 8.0  # of steps that are measured, by the hint of the row
 _FEWEST_STEPS, _MOST_STEPS = 8, 60
 _FRAMES = 4
-# Every so many frames of those that a run uses: seconds instead of a minute to sample a subject.
+# Only some of the frames that a run uses: seconds instead of a minute to sample a subject.
 _SPARSE = 12
 _GENERATED = ("builtin", "clothed", "stick2d")  # data sets without files
 

@@ -77,7 +77,7 @@ def test_signals_that_nobody_sends_on_purpose_may_pass():
     names = {"SIGKILL": ALONE, "SIGBUS": AGAIN, "SIGSEGV": AGAIN, "SIGABRT": AGAIN, "SIGTERM": "", "SIGINT": "", "SIGILL": ""}
     for name, wanted in names.items():
         assert retry_of(-getattr(signal, name), "") == wanted
-    for code in (1, 129, 130, 143, -99):  # a fault of the program, or somebody has asked it to end
+    for code in (1, 129, 130, 143, -99):  # a fault of the program, or a request to end
         assert retry_of(code, "interrupted; out of memory") == ""
 
 

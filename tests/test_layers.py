@@ -18,7 +18,7 @@ LAYERS = (
     ("commands",),
     ("reproduce",),
     ("training", "viewer"),
-    ("avatar", "evaluation", "fitting"),
+    ("avatar", "evaluation", "fitting", "registration"),
     ("export", "rendering", "samples"),
     ("datasets", "meshing"),
     ("models", "motions"),

@@ -81,6 +81,7 @@ for path in sorted(folder.rglob("*.py")):
         "evaluation",
         "export",
         "fitting",
+        "registration",
         "meshing",
         "motions",
         "rendering",

@@ -1,0 +1,56 @@
+"""The points of one frame, in the form in which a body is fitted to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+__all__ = ["NORMALS_M", "ScanPoints", "with_normals"]
+
+Array = NDArray[np.float64]
+
+NORMALS_M = 0.08
+"""Distance that counts as much as normals at 60 degrees to each other, in the search of closest points."""
+
+
+@dataclass(frozen=True)
+class ScanPoints:
+    """Points on the surface of one frame, metres, y up."""
+
+    points: Array
+    """[P, 3], metres."""
+    normals: Array
+    """[P, 3], unit length, outward."""
+
+    @classmethod
+    def sampled(cls, points: Array, normals: Array, count: int, seed: int = 0) -> ScanPoints:
+        """Return at most `count` of the points, by chance; the same seed gives the same points."""
+        order = np.random.default_rng(seed).permutation(len(points))[:count]
+        return cls(np.asarray(points, np.float64)[order], np.asarray(normals, np.float64)[order])
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def features(self) -> Array:
+        """[P, 6], places and scaled normals."""
+        return with_normals(self.points, self.normals)
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """Of the features."""
+        return KDTree(self.features)
+
+    @cached_property
+    def centre(self) -> Array:
+        """[3], middle of the box around the points, metres."""
+        return (self.points.max(0) + self.points.min(0)) / 2
+
+
+def with_normals(points: Array, normals: Array) -> Array:
+    """Return places and scaled normals [N, 6] of points and normals [N, 3], between which closest points are searched."""
+    return np.concatenate([points, NORMALS_M * normals], 1)

@@ -1,0 +1,222 @@
+"""Gauss-Newton steps that bring the surface of a body onto the points of a scan.
+
+Every step matches the vertices of the body with the closest points of the scan, and points of the scan with the closest
+vertices (by place and normal), and solves one small linear system for the turns of all joints, the place and, where it is free,
+the shape. Matches are weighted by Geman-McClure's function of their distance, whose scale shrinks from step to step. A distance
+counts fully along the normal of the scan (point-to-plane, Chen and Medioni 1992), and a little in all directions, which keeps
+limbs from sliding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface
+from snarfcli.registration.rotations import matrix_to_vector
+from snarfcli.registration.scan_points import ScanPoints, with_normals
+
+__all__ = ["Agreement", "PosePrior", "Pull", "StepOptions", "agreement", "fit_state", "scales", "step"]
+
+Array = NDArray[np.float64]
+
+_LEAST_AGREEMENT = 0.2  # cosine between the normals of a match; with less, a match counts little
+_DISAGREEING_WEIGHT = 0.02
+_ALL_DIRECTIONS = 0.1  # weight of the distance in all directions, relative to that along the normal
+_SCAN_POINTS = 1000  # of a scan that are matched with vertices; the vertices are matched with all points
+_SHAPE_PRIOR = 1e-6  # per squared unit of a shape parameter; the weights of the matches of each side sum to 1, metres squared
+_DAMPING = 1e-6  # relative to the mean of the diagonal
+_LONGEST_TURN_RAD = 0.35  # in one step
+_LONGEST_SHIFT_M = 0.2
+_LONGEST_BETA = 1.0
+_RESIDUAL_CAP_M = 0.1  # a longer distance counts as this one in the residual
+_OBJECTIVE_M = 0.05  # scale of the objective
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """How poses usually are: a normal distribution of the rotation vectors of each joint but the root."""
+
+    mean: Array
+    """[J, 3], axis-angle, radians."""
+    weight: Array
+    """[J, 3], squared metres per squared radian: how much a deviation costs against the mean squared distance of matches."""
+
+    @classmethod
+    def weak(cls, joints: int, mean: Array | None = None, weight: float = 2e-6) -> PosePrior:
+        """Return a prior that matters only for turns which the scan does not show."""
+        return cls(np.zeros((joints, 3)) if mean is None else mean, np.full((joints, 3), weight))
+
+
+@dataclass(frozen=True)
+class Pull:
+    """A state to stay near to, such as that of a neighbour in time; only the turns of joints count."""
+
+    state: BodyState
+    weight: float
+    """Squared metres per squared radian."""
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """What a step may change, and how it weighs matches."""
+
+    scale_m: float
+    """Distance at which a match has a quarter of its weight, metres."""
+    shape_is_free: bool = False
+    """Change the shape parameters, too."""
+    pull: Pull | None = None
+    clothes_m: float = 0.0
+    """The body is inside the scan: it may be so far below the surface without cost, metres."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well a body and a scan agree."""
+
+    objective: float
+    """Mean robust distance of both sides, from 0 (perfect) to 2 (nothing matches)."""
+    residual_m: float
+    """Mean distance of both sides, distances above 10 cm counted as 10 cm, metres."""
+    of_body: Array
+    """[K], distance from each vertex to its match, metres."""
+    of_scan: Array
+    """[M], distance from each of the first M points of the scan to its match, metres."""
+    partners: NDArray[np.intp]
+    """[M], numbers of these matches among the body's vertices."""
+
+
+@dataclass(frozen=True)
+class _Matches:
+    body: NDArray[np.intp]  # [K + M] numbers of vertices; K matches of vertices, then M of points
+    points: Array  # [K + M, 3]
+    normals: Array  # [K + M, 3]
+    agree: NDArray[np.bool_]  # [K + M]
+    offset: Array  # [K + M, 3] from the point of the scan to the vertex, metres
+    share: Array  # [K + M] 1 / K or 1 / M
+
+    @property
+    def distance(self) -> Array:
+        return np.linalg.norm(self.offset, axis=1)
+
+
+def scales(first_m: float, last_m: float, steps: int) -> Array:
+    """Return the scales of a number of steps, metres, falling evenly by ratio."""
+    return np.geomspace(first_m, last_m, steps)
+
+
+def fit_state(
+    surface: BodySurface,
+    state: BodyState,
+    scan: ScanPoints,
+    scales_m: Sequence[float] | Array,
+    prior: PosePrior,
+    *,
+    shape_is_free: bool = False,
+    pull: Pull | None = None,
+    clothes_m: float = 0.0,
+) -> BodyState:
+    """Take one step per scale; arguments as in `step` and `StepOptions`."""
+    for scale in scales_m:
+        state = step(surface, state, scan, prior, StepOptions(float(scale), shape_is_free, pull, clothes_m))
+    return state
+
+
+def step(surface: BodySurface, state: BodyState, scan: ScanPoints, prior: PosePrior, options: StepOptions) -> BodyState:
+    """Take one step.
+
+    Args:
+        surface: the body.
+        state: where it is.
+        scan: the points.
+        prior: of the pose.
+        options: of the step.
+    """
+    posed, derivatives = surface.posed_with_derivatives(state)
+    matches = _match(posed, scan)
+    turns = 3 * surface.num_joints
+    size = turns + 3 + (surface.num_betas if options.shape_is_free else 0)
+    rows = derivatives.rows(matches.body)[:, :, :size]
+    along = np.einsum("nc,ncd->nd", matches.normals, rows)
+    height = _height((matches.offset * matches.normals).sum(1), options.clothes_m)
+    weight = matches.share / np.square(1 + np.square(matches.distance / options.scale_m))
+    weight = np.where(matches.agree, weight, _DISAGREEING_WEIGHT * weight)
+    everywhere = rows.reshape(-1, size) * np.repeat(_ALL_DIRECTIONS * weight, 3)[:, None]
+    system = (along * weight[:, None]).T @ along + everywhere.T @ rows.reshape(-1, size)
+    gradient = along.T @ (weight * height) + everywhere.T @ matches.offset.reshape(-1)
+    _add_prior(system, gradient, surface, state, posed, prior)
+    if options.pull is not None:
+        _add_pull(system, gradient, state, posed, options.pull)
+    shape = np.arange(turns + 3, size)
+    system[shape, shape] += _SHAPE_PRIOR
+    gradient[turns + 3 :] += _SHAPE_PRIOR * state.betas[: size - turns - 3]
+    system[np.diag_indices(size)] += _DAMPING * np.trace(system) / size
+    change = -np.linalg.solve(system, gradient)
+    turned = _at_most(change[:turns].reshape(-1, 3), _LONGEST_TURN_RAD)
+    betas = state.betas + np.clip(change[turns + 3 :], -_LONGEST_BETA, _LONGEST_BETA) if options.shape_is_free else state.betas
+    translation = state.translation + _at_most(change[turns : turns + 3], _LONGEST_SHIFT_M)
+    return BodyState(surface.turned(state, posed, turned), translation, betas)
+
+
+def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints) -> Agreement:
+    """Measure how well a body agrees with a scan."""
+    matches = _match(surface.posed(state), scan)
+    count = len(surface.points_rest)
+    distance = matches.distance
+    squared = np.square(distance)
+    capped = np.minimum(distance, _RESIDUAL_CAP_M)
+    return Agreement(
+        objective=float((matches.share * squared / (squared + _OBJECTIVE_M**2)).sum()),
+        residual_m=float((matches.share * capped).sum() / 2),
+        of_body=distance[:count],
+        of_scan=distance[count:],
+        partners=matches.body[count:],
+    )
+
+
+def _match(posed: PosedSurface, scan: ScanPoints) -> _Matches:
+    """Match every vertex with a point, and some points with a vertex."""
+    features = with_normals(posed.points, posed.normals)
+    _, partner = scan.tree.query(features)
+    count = min(_SCAN_POINTS, len(scan))  # the points of a scan are in random order
+    _, back = KDTree(features).query(scan.features[:count])
+    body = np.concatenate([np.arange(len(features)), back])
+    chosen = np.concatenate([partner, np.arange(count)])
+    points, normals = scan.points[chosen], scan.normals[chosen]
+    agree = (posed.normals[body] * normals).sum(1) > _LEAST_AGREEMENT
+    share = np.concatenate([np.full(len(features), 1 / len(features)), np.full(count, 1 / count)])
+    return _Matches(body, points, normals, agree, posed.points[body] - points, share)
+
+
+def _height(height: Array, clothes_m: float) -> Array:
+    """Return the distance above the surface that counts, metres: none from `clothes_m` below it to the surface."""
+    return np.where(height > 0, height, np.minimum(height + clothes_m, 0.0)) if clothes_m else height
+
+
+def _add_prior(
+    system: Array, gradient: Array, surface: BodySurface, state: BodyState, posed: PosedSurface, prior: PosePrior
+) -> None:
+    """Add the cost of an unusual pose; a small turn in the axes of the parent is taken as a change of the rotation vector."""
+    deviation = state.pose - prior.mean
+    for joint, parent in enumerate(surface.parents):
+        if parent < 0:
+            continue
+        block, axes = slice(3 * joint, 3 * joint + 3), posed.turns[parent]
+        system[block, block] += (axes * prior.weight[joint]) @ axes.T
+        gradient[block] += axes @ (prior.weight[joint] * deviation[joint])
+
+
+def _add_pull(system: Array, gradient: Array, state: BodyState, posed: PosedSurface, pull: Pull) -> None:
+    """Add the cost of joints that are turned otherwise than in the state to stay near to."""
+    apart = matrix_to_vector(pull.state.rotations.transpose(0, 2, 1) @ state.rotations)
+    gradient[: apart.size] += pull.weight * (posed.turns @ apart[..., None]).reshape(-1)
+    system[np.arange(apart.size), np.arange(apart.size)] += pull.weight
+
+
+def _at_most(vectors: Array, longest: float) -> Array:
+    """Return vectors [..., 3], shortened to a length of at most `longest`."""
+    return vectors * (longest / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), longest))

@@ -10,7 +10,7 @@ limbs from sliding.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ _LEAST_AGREEMENT = 0.2  # cosine between the normals of a match; with less, a ma
 _DISAGREEING_WEIGHT = 0.02
 _ALL_DIRECTIONS = 0.1  # weight of the distance in all directions, relative to that along the normal
 _SCAN_POINTS = 1000  # of a scan that are matched with vertices; the vertices are matched with all points
+_LEAST_WEIGHT = 1e-12  # keeps the weights of a vertex positive definite
 _SHAPE_PRIOR = 1e-6  # per squared unit of a shape parameter; the weights of the matches of each side sum to 1, metres squared
 _DAMPING = 1e-6  # relative to the mean of the diagonal
 _LONGEST_TURN_RAD = 0.35  # in one step
@@ -35,6 +36,9 @@ _LONGEST_SHIFT_M = 0.2
 _LONGEST_BETA = 1.0
 _RESIDUAL_CAP_M = 0.1  # a longer distance counts as this one in the residual
 _OBJECTIVE_M = 0.05  # scale of the objective
+_ROW, _COLUMN = np.triu_indices(3)  # the six different entries of a symmetric matrix
+_IS_DIAGONAL = _ROW == _COLUMN
+_ENTRY = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
@@ -137,17 +141,12 @@ def step(surface: BodySurface, state: BodyState, scan: ScanPoints, prior: PosePr
         options: of the step.
     """
     posed, derivatives = surface.posed_with_derivatives(state)
-    matches = _match(posed, scan)
     turns = 3 * surface.num_joints
     size = turns + 3 + (surface.num_betas if options.shape_is_free else 0)
-    rows = derivatives.rows(matches.body)[:, :, :size]
-    along = np.einsum("nc,ncd->nd", matches.normals, rows)
-    height = _height((matches.offset * matches.normals).sum(1), options.clothes_m)
-    weight = matches.share / np.square(1 + np.square(matches.distance / options.scale_m))
-    weight = np.where(matches.agree, weight, _DISAGREEING_WEIGHT * weight)
-    everywhere = rows.reshape(-1, size) * np.repeat(_ALL_DIRECTIONS * weight, 3)[:, None]
-    system = (along * weight[:, None]).T @ along + everywhere.T @ rows.reshape(-1, size)
-    gradient = along.T @ (weight * height) + everywhere.T @ matches.offset.reshape(-1)
+    if not options.shape_is_free:
+        derivatives = replace(derivatives, by_beta=derivatives.by_beta[:, :, :0])
+    weights, pulls = _by_vertex(_match(posed, scan), len(posed.points), options)
+    system, gradient = derivatives.normal_equations(weights, pulls)
     _add_prior(system, gradient, surface, state, posed, prior)
     if options.pull is not None:
         _add_pull(system, gradient, state, posed, options.pull)
@@ -155,7 +154,7 @@ def step(surface: BodySurface, state: BodyState, scan: ScanPoints, prior: PosePr
     system[shape, shape] += _SHAPE_PRIOR
     gradient[turns + 3 :] += _SHAPE_PRIOR * state.betas[: size - turns - 3]
     system[np.diag_indices(size)] += _DAMPING * np.trace(system) / size
-    change = -np.linalg.solve(system, gradient)
+    change = -np.linalg.solve(system, gradient).astype(np.float64, copy=False)
     turned = _at_most(change[:turns].reshape(-1, 3), _LONGEST_TURN_RAD)
     betas = state.betas + np.clip(change[turns + 3 :], -_LONGEST_BETA, _LONGEST_BETA) if options.shape_is_free else state.betas
     translation = state.translation + _at_most(change[turns : turns + 3], _LONGEST_SHIFT_M)
@@ -192,9 +191,24 @@ def _match(posed: PosedSurface, scan: ScanPoints) -> _Matches:
     return _Matches(body, points, normals, agree, posed.points[body] - points, share)
 
 
-def _height(height: Array, clothes_m: float) -> Array:
-    """Return the distance above the surface that counts, metres: none from `clothes_m` below it to the surface."""
-    return np.where(height > 0, height, np.minimum(height + clothes_m, 0.0)) if clothes_m else height
+def _by_vertex(matches: _Matches, count: int, options: StepOptions) -> tuple[Array, Array]:
+    """Return the weights [K, 3, 3] and pulls [K, 3] of the vertices, summed over their matches."""
+    height = (matches.offset * matches.normals).sum(1)
+    free = np.clip(height, -options.clothes_m, 0.0)  # what counts as no distance
+    height = height - free
+    offset = matches.offset - free[:, None] * matches.normals
+    weight = matches.share / np.square(1 + np.square(offset).sum(1) / options.scale_m**2)
+    weight = np.where(matches.agree, weight, _DISAGREEING_WEIGHT * weight)
+    pulls = weight[:, None] * (height[:, None] * matches.normals + _ALL_DIRECTIONS * offset)
+    outer = weight[:, None] * matches.normals[:, _ROW] * matches.normals[:, _COLUMN]
+    outer[:, _IS_DIAGONAL] += (_ALL_DIRECTIONS * weight)[:, None]
+    values = np.concatenate([outer, pulls], 1)
+    sums = values[:count]  # the first K matches are those of the K vertices, in order
+    for column in range(values.shape[1]):
+        sums[:, column] += np.bincount(matches.body[count:], values[count:, column], count)
+    weights = sums[:, _ENTRY]
+    weights[:, np.arange(3), np.arange(3)] += _LEAST_WEIGHT
+    return weights, sums[:, 6:]
 
 
 def _add_prior(

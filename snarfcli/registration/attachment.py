@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from snarfcli.registration.body_surface import BodyState, BodySurface, farthest_points, vertex_normals
+from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface, farthest_points, vertex_normals
 from snarfcli.registration.scan_points import with_normals
 
 __all__ = ["AttachedPoints", "attach", "refine", "with_mean_offsets"]
@@ -24,7 +24,9 @@ _SHORTEST_OFFSET_M, _LONGEST_OFFSET_M = 0.003, 0.01  # about how long offsets ar
 _PINNED = 1e3  # weight of offsets that are none
 _MOVING_M = 0.005  # a point that moves so far against the body counts a quarter, or of three times the median if that is more
 _LEAST_VOLUME = 0.3  # a point that skinning squeezes to less than this share in some frame says nothing about the others
+_REGULAR = 1e-9  # keeps points at which skinning is singular, those of a part turned by 180 degrees, from being an error
 _STEPS = 8
+_STEADY = 1e-4  # largest change of a turn, radians, or of a place or shape, after which no more steps are taken
 _POINTS = 600  # that take part in the joint steps; the offsets of all follow
 _SHAPE_PRIOR = 1e-6  # as in the solver
 _DAMPING = 1e-7  # relative to the mean of the diagonal
@@ -92,7 +94,7 @@ def _attach_in_frame(
     facing = [with_normals(vertices[chosen], sign * normals) for sign in (1.0, -1.0)]
     features = min(facing, key=lambda features: tree.query(features)[0].sum())
     distances, attached = _interpolated(surface, tree, features)
-    blended = (attached.weights @ posed.turns.reshape(-1, 9)).reshape(-1, 3, 3)
+    blended, _ = _blended(attached, posed)
     turned = (blended.transpose(0, 2, 1) @ features[:, 3:, None])[..., 0]
     turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
     attached = replace(attached, normals_rest=turned, vertex_numbers=chosen)
@@ -150,10 +152,15 @@ def unposed(surface: BodySurface, state: BodyState, points: Array) -> tuple[Arra
         volumes: [K], by which the skinning of a point scales space, 1 for a rotation.
     """
     posed = surface.posed(state)
-    blended = (surface.weights @ posed.turns.reshape(-1, 9)).reshape(-1, 3, 3)
-    back = np.linalg.pinv(blended)
+    blended, back = _blended(surface, posed)
     rest = surface.points_rest + (back @ (points - posed.points)[..., None])[..., 0]
     return rest, np.linalg.det(blended)
+
+
+def _blended(surface: BodySurface, posed: PosedSurface) -> tuple[Array, Array]:
+    """Return the matrices [K, 3, 3] with which skinning moves the points, and their inverses."""
+    blended = (surface.weights @ posed.turns.reshape(-1, 9)).reshape(-1, 3, 3)
+    return blended, np.asarray(np.linalg.inv(blended + _REGULAR * np.eye(3)), np.float64)
 
 
 def refine(
@@ -184,13 +191,15 @@ def refine(
     offset_weight = _PINNED if body is None else np.square(_NOISE_M / (_LONGEST_OFFSET_M + clothes_m))
     attached = with_mean_offsets(attached, states, frames, offset_weight)
     for _ in range(_STEPS):
-        states = _joint_step(attached.first(_POINTS), states, frames[:, :_POINTS], offset_weight, shape_is_free)
+        states, change = _joint_step(attached.first(_POINTS), states, frames[:, :_POINTS], offset_weight, shape_is_free)
         if body is not None:
             attached = _attached_again(body, attached, states[0].betas)
             usual = float(np.median(np.linalg.norm(attached.offsets, axis=1)))
             usual = min(max(usual, _SHORTEST_OFFSET_M + clothes_m), _LONGEST_OFFSET_M + clothes_m)
             offset_weight = np.square(_NOISE_M / usual)
         attached = with_mean_offsets(attached, states, frames, offset_weight)
+        if change < _STEADY:
+            break
     return attached, states
 
 
@@ -216,8 +225,12 @@ def with_mean_offsets(
 
 def _joint_step(
     attached: AttachedPoints, states: list[BodyState], frames: Array, offset_weight: float, shape_is_free: bool
-) -> list[BodyState]:
-    """Take one Gauss-Newton step of all poses and the shape; the offsets, which follow from them, are eliminated."""
+) -> tuple[list[BodyState], float]:
+    """Take one Gauss-Newton step of all poses and the shape; the offsets, which follow from them, are eliminated.
+
+    Returns:
+        The states, and the largest change of a number.
+    """
     surface = attached.surface
     turns, count = 3 * surface.num_joints, 3 * surface.num_joints + 3
     betas = surface.num_betas if shape_is_free else 0
@@ -230,7 +243,7 @@ def _joint_step(
     for number, (state, points) in enumerate(zip(states, frames, strict=True)):
         posed, derivatives = surface.posed_with_derivatives(state)
         posed_frames.append(posed)
-        back = root[..., None] * np.linalg.pinv((surface.weights @ posed.turns.reshape(-1, 9)).reshape(-1, 3, 3))
+        back = root[..., None] * _blended(surface, posed)[1]
         rows = (back @ derivatives.rows(np.arange(len(points)))[:, :, : count + betas]).reshape(-1, count + betas)
         residual = (back @ (posed.points - points)[..., None]).reshape(-1)
         place = np.concatenate([np.arange(number * count, (number + 1) * count), np.arange(shape.start, size)])
@@ -251,4 +264,4 @@ def _joint_step(
         own = change[number * count : (number + 1) * count]
         turned = surface.turned(state, posed, own[:turns].reshape(-1, 3))
         moved.append(BodyState(turned, state.translation + own[turns:], new_betas))
-    return moved
+    return moved, float(np.abs(change).max())

@@ -35,6 +35,14 @@ class Command:
 
 COMMAND_LIST = (
     Command(
+        "fit",
+        "fit",
+        "FitConfig",
+        "fit a body to scans without poses: meshes or point clouds of a person",
+        "snarf fit data=meshes subject=me",
+        {},
+    ),
+    Command(
         "preprocess",
         "preprocess",
         "PreprocessConfig",
@@ -112,4 +120,5 @@ COMMAND_LIST = (
         is_hidden=True,
     ),
 )
-COMMANDS = {command.name: command for command in COMMAND_LIST} | {"evaluate": COMMAND_LIST[2]}
+COMMANDS = {command.name: command for command in COMMAND_LIST}
+COMMANDS["evaluate"] = COMMANDS["eval"]

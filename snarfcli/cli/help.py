@@ -16,7 +16,8 @@ def overview() -> str:
     return (
         "snarf learns an animatable avatar of one subject from posed meshes.\n\n"
         f"usage: snarf COMMAND [FLAGS] [SETTING=VALUE ...]\n\n{rows}\n\n"
-        'Run preprocess, train, eval and animate in this order; "snarf doctor" checks the installation.\n'
+        "Run preprocess, train, eval and animate in this order, and before them fit for scans without poses; "
+        '"snarf doctor" checks the installation.\n'
         '"snarf COMMAND --help" lists the settings of a command, "snarf --version" prints the version.'
     )
 

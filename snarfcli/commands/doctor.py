@@ -12,6 +12,7 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from omegaconf import MISSING
@@ -131,6 +132,7 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
     from snarfcli.datasets.registry import find_dataset
     from snarfcli.datasets.sources import Request
     from snarfcli.datasets.subjects import SubjectData
+    from snarfcli.registration.fit_report import fit_remarks
     from snarfcli.rendering.bones import write_bones_figure
 
     request = Request(data, Path(config.data_root), config.body)
@@ -149,7 +151,7 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
             return Remark("figure", str(figure))
 
         log.info("subject %s", subject)
-        for remark in check_subject(subject, request, draw):
+        for remark in chain(check_subject(subject, request, draw), fit_remarks(subject, request)):
             mark = {"fact": "", "warning": "warning: ", "problem": "PROBLEM: "}[remark.kind]
             log.info("  %-16s%s%s", remark.name, mark, remark.text)
             if remark.kind == "problem" and subject not in unusable:

@@ -7,8 +7,10 @@ from pathlib import Path
 from snarfcli.datasets.rigged import RIG_SUFFIXES
 from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError, nearest
+from snarfcli.formats.surfaces import list_surfaces
 
 __all__ = [
+    "POSE_FILES",
     "POSE_SUFFIXES",
     "WANTED",
     "files_with",
@@ -22,12 +24,13 @@ __all__ = [
     "subject_places",
 ]
 
+POSE_FILES = ("poses.npz", "poses.json", "motion.bvh")
+"""Usual names of pose files."""
 POSE_SUFFIXES = (".npz", ".json", ".bvh")
 """Suffixes of pose files."""
 WANTED = "a rigged <subject>.glb, or <subject>/ with skeleton.json and one folder of meshes and poses per sequence"
 """What a folder of subjects must have, for messages."""
 _SKELETON_FILES = ("skeleton.json", "skeleton.npz", "skeleton.bvh")
-_POSE_FILES = ("poses.npz", "poses.json", "motion.bvh")
 _NO_POSES = ("split.json", *_SKELETON_FILES)
 
 
@@ -88,7 +91,9 @@ def missing_parts(folder: Path) -> str:
     inside = [folder, *subfolders(folder)]
     if any((path / "motion.bvh").is_file() for path in inside):
         return ""
-    return f"{folder} has no skeleton: wanted skeleton.json, .npz or .bvh, a rigged .glb, or motion.bvh in its sequences"
+    missing = f"{folder} has no skeleton: wanted skeleton.json, .npz or .bvh, a rigged .glb, or motion.bvh in its sequences"
+    fits = f'; for scans of a person, "snarf fit data=meshes subject={folder.name}" makes skeleton and poses'
+    return missing + (fits if any(map(list_surfaces, inside)) else "")
 
 
 def subfolders(folder: Path) -> list[Path]:
@@ -119,9 +124,9 @@ def pose_file(folder: Path) -> Path:
     Raises:
         UserError: there is none, or several.
     """
-    named = [folder / name for name in _POSE_FILES if (folder / name).is_file()]
+    named = [folder / name for name in POSE_FILES if (folder / name).is_file()]
     others = [path for path in files_with(folder, POSE_SUFFIXES) if path.name not in _NO_POSES]
     if len(named or others) != 1:
         got = ", ".join(path.name for path in named or others) or "none"
-        raise UserError(f"{folder}: wanted one pose file ({', '.join(_POSE_FILES)}), got {got}; add or remove files")
+        raise UserError(f"{folder}: wanted one pose file ({', '.join(POSE_FILES)}), got {got}; add or remove files")
     return (named or others)[0]

@@ -57,7 +57,7 @@ from snarfcli.datasets.mesh_folders import (
     subject_places,
 )
 from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
-from snarfcli.datasets.recorded_sequence import FileToWorld, RecordedSequence, person_scale
+from snarfcli.datasets.recorded_sequence import FileToWorld, RecordedSequence, check_scale, person_scale
 from snarfcli.datasets.recorded_splits import choose_splits, split_patterns
 from snarfcli.datasets.rigged import bvh_poses, bvh_skeleton, read_rigged_files
 from snarfcli.datasets.settings import DataConfig
@@ -72,8 +72,6 @@ from snarfcli.names import folder_names
 from snarfcli.texts import counted
 
 __all__ = ["load", "subjects"]
-
-_SCALE_LIMITS = (1e-6, 1e6)  # metres per unit, from micrometres to 1000 km
 
 
 def subjects(request: Request) -> tuple[str, ...]:
@@ -290,11 +288,4 @@ def _conversion_text(why: str, up: str) -> str:
 def _check_settings(config: DataConfig) -> None:
     check_choice("data.up", config.up, ("auto", "y", "z"))
     check_choice("data.canonical", config.canonical, ("auto", "rest", "legs_apart"))
-    if config.scale != "auto":
-        try:
-            scale = float(config.scale)
-        except ValueError:
-            scale = math.nan
-        if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
-            limits = f"from {_SCALE_LIMITS[0]:g} to {_SCALE_LIMITS[1]:g}"
-            raise UserError(f"data.scale: wanted auto or metres per unit {limits}, got '{config.scale}'")
+    check_scale(config.scale)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,13 +15,15 @@ from snarfcli.datasets.posed_meshes import FileMeshes, RigMeshes
 from snarfcli.datasets.skeleton_files import PoseFile, SkeletonFile
 from snarfcli.datasets.splits import Split, held_back_start
 from snarfcli.datasets.subjects import SequenceSpec
+from snarfcli.errors import UserError
 from snarfcli.motions import Motion
 
-__all__ = ["PERSON_M", "FileToWorld", "RecordedSequence", "person_scale"]
+__all__ = ["PERSON_M", "FileToWorld", "RecordedSequence", "check_scale", "person_scale"]
 
 PERSON_M = 1.8
 """Longest side after scaling, metres: the lengths in the settings of training fit a person."""
 
+_SCALE_LIMITS = (1e-6, 1e6)  # metres per unit, from micrometres to 1000 km
 _NEAR_A_PERSON_M = (1.2, 2.4)
 _TOLERANCE_M = 1e-3  # poses that reproduce the bone transforms within a millimetre replace them
 
@@ -141,3 +144,20 @@ def person_scale(length: float, whole: float, wanted: str, given: float | None) 
         return 1.0, f"not scaled: {length:.2f} m long{part}" + ("; data.scale=NUMBER sets it" if part else "")
     scale = PERSON_M / length
     return scale, f"scaled by {scale:.4g}, so {length:.4g} units{part} become {PERSON_M} m; data.scale=NUMBER sets it"
+
+
+def check_scale(wanted: str) -> None:
+    """Check the setting data.scale.
+
+    Raises:
+        UserError: it is neither auto nor a number of metres in range.
+    """
+    if wanted == "auto":
+        return
+    try:
+        scale = float(wanted)
+    except ValueError:
+        scale = math.nan
+    if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
+        limits = f"from {_SCALE_LIMITS[0]:g} to {_SCALE_LIMITS[1]:g}"
+        raise UserError(f"data.scale: wanted auto or metres per unit {limits}, got '{wanted}'")

@@ -80,6 +80,30 @@ class SurfaceDerivatives:
         rows[:, :, 3 * joints + 3 :] = by_beta
         return rows
 
+    def normal_equations(self, weights: Array, pulls: Array) -> tuple[Array, Array]:
+        """Return the sums over all points of d^T W d, [D, D], and d^T p, [D]; d [3, D]: the rows of a point, D = 3 J + 3 + S.
+
+        Args:
+            weights: [K, 3, 3], W of each point, symmetric and positive definite.
+            pulls: [K, 3], p of each point.
+        """
+        joints = self.levers.shape[1]
+        roots = np.linalg.cholesky(weights).transpose(0, 2, 1)  # W = R^T R; rows of R d, by r (w x a) = w (a x r)
+        x, y, z = (self.levers[:, None, :, axis] for axis in range(3))
+        along_x, along_y, along_z = (roots[:, :, None, axis] for axis in range(3))
+        rows = np.empty((len(roots), 3, 3 * joints + 3 + self.by_beta.shape[2]))
+        turns = rows[:, :, : 3 * joints].reshape(len(roots), 3, joints, 3)
+        turns[..., 0] = y * along_z - z * along_y
+        turns[..., 1] = z * along_x - x * along_z
+        turns[..., 2] = x * along_y - y * along_x
+        rows[:, :, 3 * joints : 3 * joints + 3] = roots
+        rows[:, :, 3 * joints + 3 :] = roots @ self.by_beta
+        flat = rows.reshape(-1, rows.shape[2])
+        moments = np.tensordot(self.levers, pulls, ((0,), (0,)))  # [J, 3, 3], sums of a p^T
+        by_turns = np.stack([moments[:, a, b] - moments[:, b, a] for a, b in ((1, 2), (2, 0), (0, 1))], 1)
+        by_beta = np.tensordot(self.by_beta, pulls, ((0, 1), (0, 1)))
+        return flat.T @ flat, np.concatenate([by_turns.reshape(-1), pulls.sum(0), by_beta])
+
 
 @dataclass(frozen=True, eq=False)
 class BodySurface:

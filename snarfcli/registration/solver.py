@@ -10,7 +10,7 @@ limbs from sliding.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,19 @@ from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurf
 from snarfcli.registration.rotations import matrix_to_vector
 from snarfcli.registration.scan_points import ScanPoints, with_normals
 
-__all__ = ["Agreement", "PosePrior", "Pull", "StepOptions", "agreement", "fit_state", "scales", "step"]
+__all__ = [
+    "SHAPE_PRIOR",
+    "Agreement",
+    "PosePrior",
+    "Pull",
+    "StepOptions",
+    "agreement",
+    "equations",
+    "fit_state",
+    "moved",
+    "scales",
+    "step",
+]
 
 Array = NDArray[np.float64]
 
@@ -28,13 +40,17 @@ _LEAST_AGREEMENT = 0.2  # cosine between the normals of a match; with less, a ma
 _DISAGREEING_WEIGHT = 0.02
 _ALL_DIRECTIONS = 0.1  # weight of the distance in all directions, relative to that along the normal
 _SCAN_POINTS = 1000  # of a scan that are matched with vertices; the vertices are matched with all points
-_SHAPE_PRIOR = 1e-6  # per squared unit of a shape parameter; the weights of the matches of each side sum to 1, metres squared
+_LEAST_WEIGHT = 1e-12  # keeps the weights of a vertex positive definite
+SHAPE_PRIOR = 1e-6  # per squared unit of a shape parameter; the weights of the matches of each side sum to 1, metres squared
 _DAMPING = 1e-6  # relative to the mean of the diagonal
 _LONGEST_TURN_RAD = 0.35  # in one step
 _LONGEST_SHIFT_M = 0.2
 _LONGEST_BETA = 1.0
 _RESIDUAL_CAP_M = 0.1  # a longer distance counts as this one in the residual
 _OBJECTIVE_M = 0.05  # scale of the objective
+_ROW, _COLUMN = np.triu_indices(3)  # the six different entries of a symmetric matrix
+_IS_DIAGONAL = _ROW == _COLUMN
+_ENTRY = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 @dataclass(frozen=True)
@@ -80,6 +96,9 @@ class Agreement:
 
     objective: float
     """Mean robust distance of both sides, from 0 (perfect) to 2 (nothing matches)."""
+    misfit: float
+    """The same of what a step makes small: distances along the surface count a tenth, those inside the clothes nothing. Unlike
+    the objective it hardly has a share that comes from the spacing of the vertices, so it tells lost limbs better."""
     residual_m: float
     """Mean distance of both sides, distances above 10 cm counted as 10 cm, metres."""
     of_body: Array
@@ -98,10 +117,6 @@ class _Matches:
     agree: NDArray[np.bool_]  # [K + M]
     offset: Array  # [K + M, 3] from the point of the scan to the vertex, metres
     share: Array  # [K + M] 1 / K or 1 / M
-
-    @property
-    def distance(self) -> Array:
-        return np.linalg.norm(self.offset, axis=1)
 
 
 def scales(first_m: float, last_m: float, steps: int) -> Array:
@@ -136,41 +151,76 @@ def step(surface: BodySurface, state: BodyState, scan: ScanPoints, prior: PosePr
         prior: of the pose.
         options: of the step.
     """
+    posed, system, gradient = equations(surface, state, scan, prior, options)
+    shape = np.arange(3 * surface.num_joints + 3, len(system))
+    system[shape, shape] += SHAPE_PRIOR
+    gradient[shape] += SHAPE_PRIOR * state.betas[: len(shape)]
+    return moved(surface, state, posed, np.asarray(-np.linalg.solve(system, gradient), np.float64))
+
+
+def equations(
+    surface: BodySurface, state: BodyState, scan: ScanPoints, prior: PosePrior, options: StepOptions
+) -> tuple[PosedSurface, Array, Array]:
+    """Return the posed surface and the damped normal equations of a step without the prior of the shape.
+
+    Args:
+        surface, state, scan, prior, options: as in `step`.
+
+    Returns:
+        posed: the surface in the state.
+        system: [D, D], D = 3 J + 3, and S more where the shape is free.
+        gradient: [D], of half the cost.
+    """
     posed, derivatives = surface.posed_with_derivatives(state)
-    matches = _match(posed, scan)
-    turns = 3 * surface.num_joints
-    size = turns + 3 + (surface.num_betas if options.shape_is_free else 0)
-    rows = derivatives.rows(matches.body)[:, :, :size]
-    along = np.einsum("nc,ncd->nd", matches.normals, rows)
-    height = _height((matches.offset * matches.normals).sum(1), options.clothes_m)
-    weight = matches.share / np.square(1 + np.square(matches.distance / options.scale_m))
-    weight = np.where(matches.agree, weight, _DISAGREEING_WEIGHT * weight)
-    everywhere = rows.reshape(-1, size) * np.repeat(_ALL_DIRECTIONS * weight, 3)[:, None]
-    system = (along * weight[:, None]).T @ along + everywhere.T @ rows.reshape(-1, size)
-    gradient = along.T @ (weight * height) + everywhere.T @ matches.offset.reshape(-1)
+    if not options.shape_is_free:
+        derivatives = replace(derivatives, by_beta=derivatives.by_beta[:, :, :0])
+    weights, pulls = _by_vertex(_match(posed, scan), len(posed.points), options)
+    system, gradient = derivatives.normal_equations(weights, pulls)
     _add_prior(system, gradient, surface, state, posed, prior)
     if options.pull is not None:
         _add_pull(system, gradient, state, posed, options.pull)
-    shape = np.arange(turns + 3, size)
-    system[shape, shape] += _SHAPE_PRIOR
-    gradient[turns + 3 :] += _SHAPE_PRIOR * state.betas[: size - turns - 3]
-    system[np.diag_indices(size)] += _DAMPING * np.trace(system) / size
-    change = -np.linalg.solve(system, gradient)
+    system[np.diag_indices(len(system))] += _DAMPING * np.trace(system) / len(system)
+    return posed, system, gradient
+
+
+def moved(surface: BodySurface, state: BodyState, posed: PosedSurface, change: Array) -> BodyState:
+    """Return a state after a change [3 J + 3] or [3 J + 3 + S], of which turns, shift and shape parameters are kept short.
+
+    Args:
+        surface: the body.
+        state: before.
+        posed: the surface in this state.
+        change: turns of the joints in the axes of the posed frame, radians; shift, metres; shape parameters.
+    """
+    turns = 3 * surface.num_joints
     turned = _at_most(change[:turns].reshape(-1, 3), _LONGEST_TURN_RAD)
-    betas = state.betas + np.clip(change[turns + 3 :], -_LONGEST_BETA, _LONGEST_BETA) if options.shape_is_free else state.betas
     translation = state.translation + _at_most(change[turns : turns + 3], _LONGEST_SHIFT_M)
+    betas = state.betas
+    if len(change) > turns + 3:
+        betas = betas + np.clip(change[turns + 3 :], -_LONGEST_BETA, _LONGEST_BETA)
     return BodyState(surface.turned(state, posed, turned), translation, betas)
 
 
-def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints) -> Agreement:
-    """Measure how well a body agrees with a scan."""
+def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints, *, clothes_m: float = 0.0) -> Agreement:
+    """Measure how well a body agrees with a scan.
+
+    Args:
+        surface: the body.
+        state: where it is.
+        scan: the points.
+        clothes_m: the body may be so far below the surface without misfit, metres.
+    """
     matches = _match(surface.posed(state), scan)
     count = len(surface.points_rest)
-    distance = matches.distance
+    distance = np.linalg.norm(matches.offset, axis=1)
     squared = np.square(distance)
     capped = np.minimum(distance, _RESIDUAL_CAP_M)
+    height, offset = _outside_clothes(matches, clothes_m)
+    apart = np.square(offset).sum(1)
+    apart = np.where(matches.agree, np.square(height) + _ALL_DIRECTIONS * apart, apart)
     return Agreement(
         objective=float((matches.share * squared / (squared + _OBJECTIVE_M**2)).sum()),
+        misfit=float((matches.share * apart / (apart + _OBJECTIVE_M**2)).sum()),
         residual_m=float((matches.share * capped).sum() / 2),
         of_body=distance[:count],
         of_scan=distance[count:],
@@ -192,9 +242,28 @@ def _match(posed: PosedSurface, scan: ScanPoints) -> _Matches:
     return _Matches(body, points, normals, agree, posed.points[body] - points, share)
 
 
-def _height(height: Array, clothes_m: float) -> Array:
-    """Return the distance above the surface that counts, metres: none from `clothes_m` below it to the surface."""
-    return np.where(height > 0, height, np.minimum(height + clothes_m, 0.0)) if clothes_m else height
+def _by_vertex(matches: _Matches, count: int, options: StepOptions) -> tuple[Array, Array]:
+    """Return the weights [K, 3, 3] and pulls [K, 3] of the vertices, summed over their matches."""
+    height, offset = _outside_clothes(matches, options.clothes_m)
+    weight = matches.share / np.square(1 + np.square(offset).sum(1) / options.scale_m**2)
+    weight = np.where(matches.agree, weight, _DISAGREEING_WEIGHT * weight)
+    pulls = weight[:, None] * (height[:, None] * matches.normals + _ALL_DIRECTIONS * offset)
+    outer = weight[:, None] * matches.normals[:, _ROW] * matches.normals[:, _COLUMN]
+    outer[:, _IS_DIAGONAL] += (_ALL_DIRECTIONS * weight)[:, None]
+    values = np.concatenate([outer, pulls], 1)
+    sums = values[:count]  # the first K matches are those of the K vertices, in order
+    for column in range(values.shape[1]):
+        sums[:, column] += np.bincount(matches.body[count:], values[count:, column], count)
+    weights = sums[:, _ENTRY]
+    weights[:, np.arange(3), np.arange(3)] += _LEAST_WEIGHT
+    return weights, sums[:, 6:]
+
+
+def _outside_clothes(matches: _Matches, clothes_m: float) -> tuple[Array, Array]:
+    """Return the heights [N] above the scan and the offsets [N, 3] from it, metres; depths up to `clothes_m` count as none."""
+    height = (matches.offset * matches.normals).sum(1)
+    free = np.clip(height, -clothes_m, 0.0)
+    return height - free, matches.offset - free[:, None] * matches.normals
 
 
 def _add_prior(

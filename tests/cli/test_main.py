@@ -26,6 +26,7 @@ from snarfcli.locks import hold_slot
 from snarfcli.slots import current_slot, use_slot
 
 COMMANDS = ("preprocess", "train", "eval", "animate", "export", "doctor", "reproduce")
+ALL_COMMANDS = ("fit", *COMMANDS)
 
 
 @pytest.fixture(autouse=True)
@@ -46,11 +47,11 @@ def test_overview_names_every_command(capsys):
     for arguments in ((), ("--help",)):
         code, out, _ = run(capsys, *arguments)
         assert code == 0
-        assert all(f"  {name}" in out for name in COMMANDS)
+        assert all(f"  {name}" in out for name in ALL_COMMANDS)
     assert run(capsys, "--version")[1].startswith("snarf 0.")
 
 
-@pytest.mark.parametrize("name", [*COMMANDS, "evaluate"])
+@pytest.mark.parametrize("name", [*ALL_COMMANDS, "evaluate"])
 def test_help_shows_purpose_example_choices_and_every_setting(capsys, name):
     code, out, _ = run(capsys, name, "--help")
     command = cli.COMMANDS[name]
@@ -106,6 +107,10 @@ WRONG = {
     ("eval", "ckpt=${oc.env:HOME"): "missing BRACE_CLOSE",
     ("eval", "ckpt={a.pt}"): "cannot read 'ckpt={a.pt}'",
     ("train",): 'no samples of subject 50002 under data/processed/builtin; run "snarf preprocess',
+    ("fit",): "subject: wanted a value, got none; give subject=VALUE",
+    ("fit", "subject=me"): "the folder of meshes data/meshes does not exist",
+    ("fit", "data=builtin", "subject=50002"): "data: wanted meshes, got builtin, which has poses already",
+    ("fit", "subject=me", "cloths=true"): "unknown setting 'cloths'; did you mean 'clothes'",
     ("preprocess", "subject=50003"): "no built-in subject '50003'; did you mean '500",
     ("eval",): 'no avatar in outputs/builtin/50002/fast_snarf; run "snarf train subject=50002" or give ckpt=PATH',
     ("eval", "--ood", "ckpt=none.pt"): "no avatar at none.pt",

@@ -59,6 +59,17 @@ def test_the_derivatives_by_turns_are_exact_without_pose_correctives(surface, st
             np.testing.assert_allclose(rows[:, :, 3 * joint + axis], (after - before) / 2e-5, atol=1e-8)
 
 
+def test_normal_equations_are_sums_of_the_rows(surface, state):
+    _, derivatives = surface.posed_with_derivatives(state)
+    draws = np.random.default_rng(5)
+    roots, pulls = draws.normal(size=(60, 3, 3)), draws.normal(size=(60, 3))
+    weights = roots @ roots.transpose(0, 2, 1)
+    rows = derivatives.rows(np.arange(60))
+    system, gradient = derivatives.normal_equations(weights, pulls)
+    np.testing.assert_allclose(system, np.einsum("kad,kab,kbe->de", rows, weights, rows), atol=1e-9)
+    np.testing.assert_allclose(gradient, np.einsum("kad,ka->d", rows, pulls), atol=1e-9)
+
+
 def vars_of(surface: BodySurface) -> dict:
     return {name: getattr(surface, name) for name in surface.__dataclass_fields__}
 

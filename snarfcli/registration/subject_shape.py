@@ -1,0 +1,150 @@
+"""Decide what all frames of a subject share: the up axis, where the extent does not tell it, and the shape of the body."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from snarfcli.datasets.recorded_sequence import FileToWorld
+from snarfcli.errors import UserError
+from snarfcli.parallel import run_in_processes
+from snarfcli.progress import progress
+from snarfcli.registration.body_surface import BodySurface
+from snarfcli.registration.fit_workers import find_single_frames
+from snarfcli.registration.fitter import Fitter
+from snarfcli.registration.scan_points import ScanPoints
+from snarfcli.registration.shape import fit_shape
+from snarfcli.registration.starts import Found
+from snarfcli.registration.subject_scans import SubjectScans
+from snarfcli.registration.surroundings import AXES
+from snarfcli.registration.written import FitMade
+from snarfcli.texts import counted
+
+__all__ = ["decide_shape"]
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+_FRAMES = 12  # that the shape is made from
+_FRAMES_OF_UP = 4
+_MOST_OBJECTIVE = 0.6  # of a person; 500 points on a person have 0.4, boxes, chairs and balls 0.9 to 1.3
+_GOOD = 1.2  # times the objective of the best frame: such frames tell the shape
+_OTHERS = 2  # parts beside the subject that are tried as another person
+_SHAPES_APART_M = 0.03  # mean distance between the bodies of two sequences
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """One frame with the body found in it."""
+
+    sequence: int
+    scan: ScanPoints
+    found: Found
+
+
+def decide_shape(subject: str, scans: SubjectScans, fitter: Fitter, settings: dict[str, Any]) -> FitMade:
+    """Find the body in a dozen frames of all sequences, and one shape for all.
+
+    Args:
+        subject: name of the subject, for messages.
+        scans: its scans.
+        fitter: the body.
+        settings: of the fit, which are kept with the result.
+
+    Raises:
+        UserError: the scans show no person, or several.
+    """
+    world = FileToWorld(scans.survey.scale, scans.survey.up or _up_by_fits(scans, fitter))
+    seen = _find(scans, world, _FRAMES)
+    best = min(one.found.agreement.objective for one in seen)
+    if best > _MOST_OBJECTIVE:
+        residual = min(one.found.agreement.residual_m for one in seen)
+        raise UserError(
+            f"no person in the scans of {subject}: in the best of {counted(len(seen), 'frame')} the body is "
+            f"{1000 * residual:.0f} mm from the points on average, wanted about 15; check data.scale (now {world.scale:g}) and "
+            f"data.up (now {world.up}), or name another body"
+        )
+    _check_others(subject, scans, world)
+    _compare_sequences(scans, fitter.surface, seen)
+    good = [one for one in seen if one.found.agreement.objective <= _GOOD * best]
+    betas = np.zeros(0)
+    if fitter.surface.num_betas:
+        shape = fit_shape(
+            fitter.surface, [(one.scan, one.found.state) for one in good], fitter.prior, clothes_m=scans.options.clothes_m
+        )
+        betas = shape.betas
+    return FitMade(betas, world, settings)
+
+
+def _up_by_fits(scans: SubjectScans, fitter: Fitter) -> str:
+    """Return the up axis with which the body fits better to some frames."""
+    cost = {}
+    for up in AXES:
+        seen = _find(scans, FileToWorld(scans.survey.scale, up), _FRAMES_OF_UP)
+        cost[up] = float(np.mean([one.found.agreement.objective for one in seen]))
+    chosen = min(cost, key=lambda up: cost[up])
+    log.info("up axis %s: the body fits better than with the other one (data.up=y or z sets it)", chosen)
+    return chosen
+
+
+def _find(scans: SubjectScans, world: FileToWorld, count: int) -> list[_Seen]:
+    """Return frames spread over all sequences, with the body found in each."""
+    frames = [(number, index) for number in range(len(scans.folders)) for index in range(len(scans.usable(number)))]
+    chosen = [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+    points = [scans.sequence(number, world)[index] for number, index in chosen]
+    found = _found_in(scans, points)
+    return [_Seen(number, scan, one) for (number, _), scan, one in zip(chosen, points, found, strict=True)]
+
+
+def _found_in(scans: SubjectScans, points: Sequence[ScanPoints]) -> list[Found]:
+    """Return the body found in each scan, by several processes."""
+    options = scans.options
+    workers = max(1, min(options.workers, len(points)))
+    parts = [points[start::workers] for start in range(workers)]
+    found: list[list[Found]] = [[] for _ in parts]
+    results = run_in_processes(find_single_frames, ((options.body, options.clothes_m, part) for part in parts), workers)
+    try:
+        for task, one in progress(results, total=len(points), desc="looking for the body", unit="frames"):
+            found[task].append(one)
+    finally:
+        results.close()
+    return [found[number % workers][number // workers] for number in range(len(points))]
+
+
+def _check_others(subject: str, scans: SubjectScans, world: FileToWorld) -> None:
+    """Raise UserError if a part beside the subject is a person too."""
+    parts = [
+        ScanPoints.sampled(world.points(points), normals @ world.turn.T, scans.options.points_per_frame)
+        for points, normals in scans.survey.others[:_OTHERS]
+    ]
+    for found in _found_in(scans, parts) if parts else []:
+        if found.agreement.objective <= _MOST_OBJECTIVE:
+            raise UserError(f"the scans of {subject} show several persons; keep one of them in each scan")
+
+
+def _compare_sequences(scans: SubjectScans, surface: BodySurface, seen: Sequence[_Seen]) -> None:
+    """Warn if the bodies of two sequences differ so much that they are hardly of one person."""
+    by_sequence: dict[int, list[Array]] = {}
+    for one in seen:
+        by_sequence.setdefault(one.sequence, []).append(one.found.state.betas)
+    middles = {number: surface.points_by_beta @ np.median(shapes, 0) for number, shapes in by_sequence.items()}
+    for number, shape in middles.items():
+        others = [other for key, other in middles.items() if key != number]
+        if others and (apart := _apart(shape, np.mean(others, 0))) > _SHAPES_APART_M:
+            log.warning(
+                "warning: the body of sequence %s differs by %.0f mm from that of the others; if these are different persons, "
+                "give each a subject folder of its own",
+                scans.names[number], 1000 * apart,
+            )  # fmt: skip
+
+
+def _apart(one: Array, other: Array) -> float:
+    """Return the mean distance between the offsets [K, 3] of two shapes without the shift between them, metres."""
+    away = one - other
+    return float(np.linalg.norm(away - away.mean(0), axis=1).mean())

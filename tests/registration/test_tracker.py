@@ -1,0 +1,98 @@
+"""Following a body through sequences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scanned_person import BETAS, PRIOR, NearFinder, Person, surface
+
+from snarfcli.registration.body_surface import BodyState
+from snarfcli.registration.scan_points import ScanPoints
+from snarfcli.registration.tracker import FittedSequence, fit_sequence
+
+
+@pytest.fixture(scope="module")
+def person() -> Person:
+    return Person("punching", 12, count=1200)
+
+
+def states_of(fitted: FittedSequence) -> list[BodyState]:
+    pairs = zip(fitted.poses, fitted.translation, strict=True)
+    return [BodyState.from_pose(pose, translation, fitted.betas) for pose, translation in pairs]
+
+
+def near(state: BodyState) -> BodyState:
+    draws = np.random.default_rng(0)
+    return BodyState.from_pose(state.pose + draws.normal(0, 0.05, state.pose.shape), state.translation + 0.03, np.zeros(10))
+
+
+def wrong(state: BodyState) -> BodyState:
+    """Return a state with both arms up."""
+    pose = state.pose
+    pose[[16, 17]] = [[0, 0, 1.4], [0, 0, -1.4]]
+    return BodyState.from_pose(pose, state.translation, state.betas)
+
+
+def test_pose_and_shape_are_found_through_a_sequence(person):
+    seen: list[int] = []
+    finder = NearFinder([near(person.states[6])], surface())
+    fitted = fit_sequence(surface(), person, finder, PRIOR, betas=None, on_frame=seen.append)
+    assert person.errors_m(states_of(fitted)).max() < 0.01  # measured 0.006
+    assert fitted.is_trusted.all()
+    assert fitted.poses.shape == (12, 24, 3)
+    assert fitted.reasons == ("",) * 12
+    assert seen == list(range(12))
+    assert np.abs(fitted.residual_m - 0.02).max() < 0.01  # the spacing of points and vertices
+
+
+def test_a_wrong_start_does_not_spoil_the_sequence(person):
+    # the first seed is right, the others are not
+    finder = NearFinder([near(person.states[2]), wrong(person.states[6]), wrong(person.states[10])], surface())
+    fitted = fit_sequence(surface(), person, finder, PRIOR, betas=BETAS)
+    assert person.errors_m(states_of(fitted)).max() < 0.01
+    np.testing.assert_array_equal(fitted.betas, BETAS)
+
+
+def test_frames_without_the_person_are_not_trusted(person):
+    class Broken:
+        def __len__(self) -> int:
+            return 12
+
+        def __getitem__(self, index: int) -> ScanPoints:
+            scan = person[index]
+            return replace(scan, points=scan.points * np.array([1.0, 0.3, 1.0])) if index in (4, 5) else scan
+
+    finder = NearFinder([near(person.states[2])], surface())
+    fitted = fit_sequence(surface(), Broken(), finder, PRIOR, betas=BETAS)
+    assert np.flatnonzero(~fitted.is_trusted).tolist() == [4, 5]
+    assert "mm from the points" in fitted.reasons[4]
+    kept = [index for index in range(12) if index not in (4, 5)]
+    assert person.errors_m(states_of(fitted))[kept].max() < 0.01
+    assert finder.calls > 3  # the bad frames were searched for, too
+
+
+def test_a_body_without_shape_parameters_is_followed(person):
+    rigid = replace(
+        surface(),
+        joints_rest=surface().rest_joints(BETAS),
+        joints_by_beta=np.zeros((24, 3, 0)),
+        points_rest=surface().points_rest + surface().points_by_beta @ BETAS,
+        points_by_beta=np.zeros((400, 3, 0)),
+    )
+
+    class Finder(NearFinder):
+        def find(self, scan, *, betas=None, clothes_m=0.0, near=()):
+            self.starts = [replace(start, betas=np.zeros(0)) for start in self.starts]
+            return super().find(scan, betas=np.zeros(0), clothes_m=clothes_m)
+
+    fitted = fit_sequence(rigid, person, Finder([person.states[6]], rigid), PRIOR, betas=None)
+    assert fitted.betas.shape == (0,)
+    found = [replace(state, betas=BETAS) for state in states_of(fitted)]
+    assert person.errors_m(found).max() < 0.01
+
+
+def test_no_frames_are_an_error():
+    with pytest.raises(ValueError, match="at least one frame"):
+        fit_sequence(surface(), [], NearFinder([], surface()), PRIOR, betas=BETAS)

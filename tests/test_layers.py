@@ -34,6 +34,7 @@ LAYERS = (
         "native",
         "output_locks",
         "parallel",
+        "point_clouds",
         "precision",
         "progress",
         "runs",

@@ -23,7 +23,7 @@ LAYERS = (
     ("datasets", "meshing"),
     ("models", "motions"),
     ("deformer", "shape"),
-    ("bodies", "draws", "networks"),
+    ("bodies", "draws", "networks", "point_clouds"),
     (
         "array_files",
         "checks",
@@ -34,7 +34,6 @@ LAYERS = (
         "native",
         "output_locks",
         "parallel",
-        "point_clouds",
         "precision",
         "progress",
         "runs",

@@ -1,9 +1,13 @@
 """Normals of points: their directions from planes through neighbours, their sides from the winding number.
 
-Neighbours along a minimum spanning tree agree about their side, cheapest where their planes are parallel (Hoppe et al., Surface
-Reconstruction from Unorganized Points, SIGGRAPH 1992). This is unsure between thin sheets, such as the sides of a hand, and
-between parts that touch, so the tree is cut at its unsure edges. The sides of the patches that are left are chosen together: on
-a closed surface with outward normals the winding number is one half everywhere (`winding.py`).
+Neighbours along a minimum spanning tree agree about their side (Hoppe et al., Surface Reconstruction from Unorganized Points,
+SIGGRAPH 1992), as two points of a circle do: the normal of one is mirrored on the plane between them, which holds on a flat
+part, around an edge and on both sides of a thin sheet. The tree prefers neighbours that lie in each other's planes, and is cut
+where it is unsure. The sides of the patches that are left are chosen together: on a closed surface with outward normals the
+winding number is one half everywhere (`winding.py`).
+
+Wrong sides on six poses of built-in subjects, of 2,000, 4,000 and 10,000 points: 3.3, 2.2 and 1.0 %, mostly at hands and feet;
+with 5 mm of noise 3.4 % of 4,000; by Hoppe's weights alone 6.6, 5.6 and 2.0 %, and 5.2 %.
 """
 
 from __future__ import annotations
@@ -24,9 +28,9 @@ Array = NDArray[np.float64]
 
 _PLANE_NEIGHBOURS = 10
 _TREE_NEIGHBOURS = 8
-_UNSURE = 0.6  # cosine between the normals of neighbours below which their sides are chosen apart
+_UNSURE = 0.4  # cost of an edge above which the sides of its ends are chosen apart
 _LEAST_PATCH = 8  # points
-_LEAST_COST = 1e-6  # of an edge; SciPy takes 0 for no edge
+_LEAST_COST = 1e-6  # SciPy takes an edge of cost 0 for none
 _NO_NORMALS = 0.6  # median cosine between given and estimated normals; that of random directions is 0.5
 _CLEARLY = 0.7  # share of the misfit: other sides are taken only if they are so much better
 
@@ -53,7 +57,7 @@ def estimate_normals(points: Array) -> Array:
     points = np.asarray(points, np.float64)
     _, neighbours = find_neighbours(points, max(_PLANE_NEIGHBOURS, _TREE_NEIGHBOURS))
     normals = plane_normals(points, neighbours[:, :_PLANE_NEIGHBOURS])
-    signs, patches = _patches(normals, neighbours[:, :_TREE_NEIGHBOURS])
+    signs, patches = _patches(points, normals, neighbours[:, :_TREE_NEIGHBOURS])
     normals = normals * signs[:, None]
     probes = WindingProbes.of(points, point_areas(points))
     return normals * _sides(probes, normals, patches)[patches, None]
@@ -89,55 +93,70 @@ def check_normals(points: Array, normals: Array) -> CheckedNormals:
     return CheckedNormals(one_sided, "pointed to both sides and were turned outward")
 
 
-def _patches(normals: Array, neighbours: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+def _edges(points: Array, normals: Array, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Return the costs [E] of edges between points, from 0 to 3, and whether the normals of their ends agree, 1 or -1, [E].
+
+    Args:
+        points: [N, 3].
+        normals: [N, 3], of either sign.
+        starts: [E], numbers of points.
+        ends: [E].
+    """
+    apart = points[ends] - points[starts]
+    apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-300)
+    rise, other_rise = ((normals[side] * apart).sum(axis=1) for side in (starts, ends))
+    along = (normals[starts] * normals[ends]).sum(axis=1) - 2 * rise * other_rise
+    return 1 - np.abs(along) + np.abs(rise) + np.abs(other_rise), np.where(along < 0, -1.0, 1.0)
+
+
+def _patches(points: Array, normals: Array, neighbours: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
     """Return the signs [N] with which normals [N, 3] agree within patches, and the number of the patch of each point [N].
 
     Args:
+        points: [N, 3].
         normals: of either sign.
         neighbours: [N, K].
     """
     count, width = neighbours.shape
-    starts = np.repeat(np.arange(count), width)
-    cost = 1 - np.abs((normals[starts] * normals[neighbours.ravel()]).sum(axis=1)) + _LEAST_COST
-    graph = csr_matrix((cost, (starts, neighbours.ravel())), (count, count))
+    starts, ends = np.repeat(np.arange(count), width), neighbours.ravel()
+    cost = np.maximum(_edges(points, normals, starts, ends)[0], _LEAST_COST)
+    graph = csr_matrix((cost, (starts, ends)), (count, count))
     tree = minimum_spanning_tree(graph.maximum(graph.T))
     tree = tree + tree.T
     signs, patches, patch_count = np.ones(count), np.full(count, -1), 0
     for root in range(count):
         if patches[root] < 0:
             order, before = breadth_first_order(tree, root, directed=False)
-            signs[order], numbers = _cut_tree(normals, order, before)
+            parents = np.empty(count, np.intp)
+            parents[order] = np.arange(len(order))
+            parents = parents[before[order[1:]]]
+            cost, agree = _edges(points, normals, order[parents], order[1:])
+            signs[order], numbers = _cut_tree(parents.tolist(), cost > _UNSURE, agree)
             patches[order] = patch_count + numbers
             patch_count += int(numbers.max()) + 1
     return signs, patches
 
 
-def _cut_tree(normals: Array, order: NDArray, before: NDArray) -> tuple[Array, NDArray[np.intp]]:
-    """Return the signs [K] and the numbers of the patches [K] of the points of one tree.
+def _cut_tree(parents: list[int], is_unsure: NDArray[np.bool_], agree: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return the signs [K] and the numbers of the patches [K] of the points of one tree; the first point is the root.
 
     Args:
-        normals: [N, 3], of all points.
-        order: [K], numbers of the tree's points; each comes after the one before it on the way from the root.
-        before: [N], the point before each point.
+        parents: [K - 1], number of the parent, which comes earlier, of each other point.
+        is_unsure: [K - 1], whether to cut the edge to the parent, if enough points are on both sides.
+        agree: [K - 1], sign of each of these points relative to its parent.
     """
-    place = np.empty(len(normals), np.intp)
-    place[order] = np.arange(len(order))
-    parents = [-1, *place[before[order[1:]]].tolist()]
-    along = np.concatenate([[1.0], (normals[order[1:]] * normals[before[order[1:]]]).sum(axis=1)])
-    is_unsure = (np.abs(along) < _UNSURE).tolist()
-    below, left = [1] * len(order), len(order)
-    is_cut = [False] * len(order)
-    for child in range(len(order) - 1, 0, -1):
-        if is_unsure[child] and below[child] >= _LEAST_PATCH and left - below[child] >= _LEAST_PATCH:
+    count = len(parents) + 1
+    below, left, is_cut = [1] * count, count, [False] * count
+    unsure = is_unsure.tolist()
+    for child in range(count - 1, 0, -1):
+        if unsure[child - 1] and below[child] >= _LEAST_PATCH and left - below[child] >= _LEAST_PATCH:
             is_cut[child] = True
             left -= below[child]
         else:
-            below[parents[child]] += below[child]
-    turns = np.where(along < 0, -1.0, 1.0).tolist()
-    signs, numbers, patch_count = [1.0] * len(order), [0] * len(order), 1
-    for child in range(1, len(order)):
-        parent = parents[child]
-        signs[child] = signs[parent] * turns[child]
+            below[parents[child - 1]] += below[child]
+    signs, numbers, patch_count = [1.0] * count, [0] * count, 1
+    for child, (parent, sign) in enumerate(zip(parents, agree.tolist(), strict=True), start=1):
+        signs[child] = signs[parent] * sign
         numbers[child] = patch_count if is_cut[child] else numbers[parent]
         patch_count += is_cut[child]
     return np.array(signs), np.array(numbers, np.intp)

@@ -30,6 +30,7 @@ __all__ = ["POINT_SUFFIXES", "PointFile", "list_frames", "read_frame", "read_poi
 POINT_SUFFIXES = (".xyz", ".npy", ".npz", ".csv", ".txt")
 """File suffixes of points that no surface has, in lower case. Of those of surfaces, .ply, .obj and .off may hold points."""
 
+_TEXT_SUFFIXES = (".csv", ".txt")
 _POINTS_OR_SURFACE = (".ply", ".obj", ".off")
 _MAX_POINTS = 2_000_000
 _MAX_ARRAY_BYTES = 2**28
@@ -50,7 +51,8 @@ class PointFile:
 def list_frames(folder: str | Path, leave_out: Collection[str] = ()) -> list[Path]:
     """Return the files of frames directly inside a folder, `frame_2` before `frame_10`; hidden files are left out.
 
-    They are those with a suffix of surfaces. Without any, they are those with the first suffix of points that there is.
+    They are those with a suffix of surfaces. Without any, they are those with the first suffix of points that there is, but of
+    text files (.csv, .txt) only those with a digit in their names, since others are notes.
 
     Args:
         folder: the folder.
@@ -62,10 +64,14 @@ def list_frames(folder: str | Path, leave_out: Collection[str] = ()) -> list[Pat
     surfaces = list_surfaces(folder)
     if surfaces:
         return surfaces
-    files = [path for path in list_files(folder, POINT_SUFFIXES) if path.name not in leave_out]
+    files = [path for path in list_files(folder, POINT_SUFFIXES) if path.name not in leave_out and _may_be_frame(path)]
     suffixes = {path.suffix.lower() for path in files}
     chosen = next((suffix for suffix in POINT_SUFFIXES if suffix in suffixes), None)
     return [path for path in files if path.suffix.lower() == chosen]
+
+
+def _may_be_frame(path: Path) -> bool:
+    return path.suffix.lower() not in _TEXT_SUFFIXES or any(letter.isdigit() for letter in path.stem)
 
 
 def read_points(path: str | Path) -> PointFile:

@@ -144,11 +144,11 @@ def test_arrays_of_objects_are_not_unpickled(tmp_path):
 
 
 def test_frames_are_surfaces_or_else_points_of_one_format(tmp_path):
-    for name in ("b10.xyz", "b9.xyz", "notes.txt", "poses.npz", ".hidden.xyz"):
+    for name in ("b10.xyz", "b9.xyz", "notes.txt", "1.txt", "poses.npz", ".hidden.xyz"):
         write(tmp_path, name, b"1 2 3\n")
     assert [path.name for path in list_frames(tmp_path)] == ["b9.xyz", "b10.xyz"]
     for path in tmp_path.glob("*.xyz"):
         path.unlink()
-    assert [path.name for path in list_frames(tmp_path, ("poses.npz",))] == ["notes.txt"]
+    assert [path.name for path in list_frames(tmp_path, ("poses.npz",))] == ["1.txt"]
     write(tmp_path, "a.ply", b"")
     assert [path.name for path in list_frames(tmp_path)] == ["a.ply"]

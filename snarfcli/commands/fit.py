@@ -43,6 +43,9 @@ class FitConfig:
     """Data folder; scans are read from <data_root>/meshes/<subject>/<sequence>, or from data.folder."""
     body: str | None = MISSING
     """Body model file in SMPL's format, or a folder with it; null for the built-in body."""
+    skeleton: str | None = MISSING
+    """A rig to fit in place of a body, such as an animal: a .glb with a skin, or a skeleton file with the mesh of the same name
+    beside it; null for none."""
     gender: str = MISSING
     """Of the body model in a folder: neutral, female or male."""
     clothes: str = MISSING
@@ -107,10 +110,12 @@ def _options(config: FitConfig) -> FitOptions:
     check_number("points_per_frame", config.points_per_frame, *_POINTS)
     check_number("frame_rate", config.frame_rate, *_FRAME_RATES)
     check_number("seed", config.seed, 0)
+    if config.body is not None and config.skeleton is not None:
+        raise UserError("body, skeleton: wanted at most one of them, got both; leave one out")
     if config.workers < 0:
         raise UserError(f"workers: wanted a number of processes, or 0 for one per core, got {config.workers}")
     return FitOptions(
-        BodyChoice(config.body, config.gender),
+        BodyChoice(config.body, config.gender, config.skeleton),
         config.data.scale,
         config.data.up,
         _clothes_m(config.clothes),

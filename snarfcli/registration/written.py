@@ -52,11 +52,13 @@ class FitMade:
     """Unit and axes of the files."""
     settings: Mapping[str, Any]
     """Settings that the poses depend on."""
+    size: float = 1.0
+    """Factor by which a rig is made larger, see `BodyChoice`."""
 
     @property
     def digest(self) -> str:
         """Tells poses of this fit from those of another one."""
-        content = [*np.asarray(self.betas).tolist(), self.world.scale, self.world.up, self.settings]
+        content = [*np.asarray(self.betas).tolist(), self.world.scale, self.world.up, self.settings, self.size]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -98,6 +100,7 @@ def write_skeleton(place: Path, skeleton: Skeleton, made: FitMade) -> None:
         "up": np.array(world.up),
         "scale": np.array(world.scale),
         "betas": np.asarray(made.betas, np.float64),
+        "size": np.array(made.size),
         "settings": np.array(json.dumps(made.settings, sort_keys=True)),
         "made_by": np.array(MADE_BY),
     }
@@ -112,7 +115,8 @@ def read_made(place: Path) -> FitMade | None:
     try:
         arrays = read_npz(path, "skeleton file")
         world = FileToWorld(float(arrays["scale"]), str(arrays["up"]))
-        return FitMade(np.asarray(arrays["betas"], np.float64), world, json.loads(str(arrays["settings"])))
+        settings = json.loads(str(arrays["settings"]))
+        return FitMade(np.asarray(arrays["betas"], np.float64), world, settings, float(arrays["size"]))
     except (UserError, KeyError, ValueError, TypeError):
         return None
 

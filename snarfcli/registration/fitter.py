@@ -57,7 +57,7 @@ class Fitter(ABC):
     @cached_property
     def prior(self) -> PosePrior:
         """Of the poses."""
-        return PosePrior.weak(self.surface.num_joints)
+        return self.library.prior()
 
     @cached_property
     def finder(self) -> PoseFinder:

@@ -126,7 +126,7 @@ def joint_error_mm(place: Path, truth: dict[str, tuple[np.ndarray, np.ndarray]])
     assert made is not None
     errors = {}
     for name, (poses, places) in truth.items():
-        fitted = read_fitted(place / name, made)
+        fitted = read_fitted(place / name, made, 24)
         assert fitted is not None
         body = builtin_body().to(torch.float64)
         found = body.pose(fitted.poses, made.betas, fitted.translation).joints

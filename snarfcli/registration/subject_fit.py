@@ -26,6 +26,7 @@ from snarfcli.registration.subject_scans import SubjectScans, read_subject
 from snarfcli.registration.subject_shape import decide_shape, resized, rig_size
 from snarfcli.registration.tracker import FittedSequence
 from snarfcli.registration.written import (
+    LONGEST_REASON,
     FitMade,
     FittedFile,
     foreign_files,
@@ -42,7 +43,6 @@ __all__ = ["fit_subject"]
 log = logging.getLogger(__name__)
 
 _FRAMES_PER_TASK = 60  # of short sequences that share a process, which takes some seconds to start
-_LONGEST_REASON = 200
 
 
 def fit_subject(subject: str, request: Request, options: FitOptions) -> bool:
@@ -82,9 +82,10 @@ def _fit(subject: str, place: Path, folders: Sequence[ScanFolder], options: FitO
     _check_others(place, folders, options)
     settings = options.recorded()
     made = None if options.overwrite else read_made(place)
+    fitter = load_fitter(options.body)
     if made is not None:
         _require_same(place, made, settings)
-    fitter = load_fitter(options.body)
+        made = made if len(made.betas) == fitter.surface.num_betas else None  # a damaged file
     frames = counted(sum(len(folder.paths) for folder in folders), "frame")
     log.info("subject %s: %s, %s; %s", subject, counted(len(folders), "sequence"), frames, fitter.source)
     if not fitter.surface.num_betas:
@@ -138,7 +139,7 @@ def _fit_missing(
         if not scans.usable(number):
             log.warning("left out: sequence %s, of which no frame can be read", folder.name)
             continue
-        there = read_fitted(folder.folder, made)
+        there = read_fitted(folder.folder, made, len(names))
         if there is not None and there.source == fingerprint(folder.paths):
             done[number] = SequenceReport(folder.name, number, there, names)
         else:
@@ -208,7 +209,7 @@ def _whole(
     """Return the poses of all frames of a sequence; those that cannot be read have the pose of the nearest one."""
     nearest = np.abs(np.arange(len(facts))[:, None] - np.array(usable)).argmin(1)
     is_read = np.isin(np.arange(len(facts)), usable)
-    reasons = [one_line(one.problem or fitted.reasons[nearest[frame]], _LONGEST_REASON) for frame, one in enumerate(facts)]
+    reasons = [one_line(one.problem or fitted.reasons[nearest[frame]], LONGEST_REASON) for frame, one in enumerate(facts)]
     return FittedFile(
         fitted.poses[nearest],
         fitted.translation[nearest],

@@ -25,7 +25,7 @@ from snarfcli.output_locks import hold_output
 from snarfcli.registration import fit_figure, fitter, subject_fit, subject_scans, subject_shape
 from snarfcli.sampling import oriented_surface_samples
 
-ACCURATE_MM = 10.0  # measured 3 to 8, with 200 vertices and 600 points
+ACCURATE_MM = 10.0  # measured 3 to 6, with 300 vertices and 1,000 points
 
 
 def _in_process(
@@ -40,7 +40,7 @@ def _in_process(
 def quick(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Fit with few vertices, in this process, from poses that are nearly right."""
     monkeypatch.setattr(fitter, "PoseFinder", QuickFinder)
-    monkeypatch.setattr(fitter, "_VERTICES", 200)
+    monkeypatch.setattr(fitter, "_VERTICES", 300)
     monkeypatch.setattr(subject_shape, "_FRAMES", 3)
     monkeypatch.setattr(fit_figure, "_PANEL", 32)
     monkeypatch.setattr(fit_figure, "_ROWS", 1)
@@ -53,7 +53,7 @@ def _config(root: Path, **changes: Any) -> FitConfig:
     data = {name: changes.pop(name) for name in ("scale", "up", "folder") if name in changes}
     return FitConfig(**{
         "subject": "me", "data": DataConfig("meshes", 1, 1, 1, **data), "data_root": str(root), "body": None, "skeleton": None,
-        "gender": "neutral", "clothes": "false", "points_per_frame": 600, "ordered": "auto", "frame_rate": 30.0,
+        "gender": "neutral", "clothes": "false", "points_per_frame": 1000, "ordered": "auto", "frame_rate": 30.0,
         "workers": 1, "seed": 0, "overwrite": False, "skip_broken": False, **changes,
     })  # fmt: skip
 
@@ -88,7 +88,7 @@ def test_sequences_are_fitted_written_and_reported(
         ("walk", 3, 0),
     ]
     assert len(report["sequences"][1]["residual_mm_per_frame"]) == 3
-    assert report["settings"]["points_per_frame"] == 600
+    assert report["settings"]["points_per_frame"] == 1000
     for line in ("2 sequences, 5 frames; the built-in body", "the files are in m", "walk: 3 frames", "all trusted", "next: "):
         assert line in caplog.text
 

@@ -37,8 +37,8 @@ Array = NDArray[np.float64]
 
 _FRAMES = 12  # that the shape is made from
 _FRAMES_OF_UP = 4
-_MOST_OBJECTIVE = 0.6  # of a person; 500 points on a person have 0.4, boxes, chairs and balls 0.9 to 1.3
-_GOOD = 1.2  # times the objective of the best frame: such frames tell the shape
+_MOST_MISFIT = 0.3  # of a person: 500 to 4,000 points have 0.03 to 0.08, boxes, chairs and balls 0.5 to 1.1
+_GOOD = 1.3  # times the misfit of the best frame: such frames tell the shape
 _OTHERS = 2  # parts beside the subject that are tried as another person
 _SHAPES_APART_M = 0.03  # mean distance between the bodies of two sequences
 
@@ -69,8 +69,8 @@ def decide_shape(subject: str, scans: SubjectScans, fitter: Fitter, settings: di
         return _by_own_vertices(scans, fitter, settings)
     world = FileToWorld(scans.survey.scale, scans.survey.up or _up_by_fits(scans, fitter))
     seen = _find(scans, world, _FRAMES)
-    best = min(one.found.agreement.objective for one in seen)
-    if best > _MOST_OBJECTIVE:
+    best = min(one.found.agreement.misfit for one in seen)
+    if best > _MOST_MISFIT:
         residual = min(one.found.agreement.residual_m for one in seen)
         what = "person" if scans.options.body.skeleton is None else "such body"
         raise UserError(
@@ -80,7 +80,7 @@ def decide_shape(subject: str, scans: SubjectScans, fitter: Fitter, settings: di
         )
     _check_others(subject, scans, world)
     _compare_sequences(scans, fitter.surface, seen)
-    good = [one for one in seen if one.found.agreement.objective <= _GOOD * best]
+    good = [one for one in seen if one.found.agreement.misfit <= _GOOD * best]
     return FitMade(_shape(scans, fitter, world, good), world, settings, scans.options.body.size)
 
 
@@ -127,7 +127,7 @@ def _up_by_fits(scans: SubjectScans, fitter: Fitter) -> str:
     cost = {}
     for up in AXES:
         seen = _find(scans, FileToWorld(scans.survey.scale, up), _FRAMES_OF_UP)
-        cost[up] = float(np.mean([one.found.agreement.objective for one in seen]))
+        cost[up] = float(np.mean([one.found.agreement.misfit for one in seen]))
     chosen = min(cost, key=lambda up: cost[up])
     log.info("up axis %s: the body fits better than with the other one (data.up=y or z sets it)", chosen)
     return chosen
@@ -163,7 +163,7 @@ def _check_others(subject: str, scans: SubjectScans, world: FileToWorld) -> None
         for points, normals in scans.survey.others[:_OTHERS]
     ]
     for found in _found_in(scans, parts) if parts else []:
-        if found.agreement.objective <= _MOST_OBJECTIVE:
+        if found.agreement.misfit <= _MOST_MISFIT:
             raise UserError(f"the scans of {subject} show several persons; keep one of them in each scan")
 
 

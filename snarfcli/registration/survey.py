@@ -108,6 +108,10 @@ def survey_samples(
         longest = max(part.length for found in apart.values() for part in found[1:])
         where = _listed(names[number] for number in apart)
         facts.append(f"left out: things apart from the subject, up to {metres * longest:.2f} m long, {where}")
+    if floors or apart:
+        facts.append(
+            "they stay in the files: cut them off before snarf preprocess, or they are learned as a part of the subject"
+        )
     wrong = {sample.sequence: sample.change for sample in samples if sample.change}
     facts += [f"normals of {names[number]} {change}" for number, change in list(wrong.items())[:_LISTED]]
     others = [

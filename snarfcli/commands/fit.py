@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 
 if TYPE_CHECKING:
+    from snarfcli.datasets.sources import Request
     from snarfcli.registration.fit_options import FitOptions
 
 __all__ = ["FitConfig", "run"]
@@ -79,18 +81,34 @@ def run(config: FitConfig) -> int:
         OSError: the data folder cannot be written to, or the disk is full.
     """
     from snarfcli.datasets.sources import Request
-    from snarfcli.registration.scans import scan_subjects
     from snarfcli.registration.subject_fit import fit_subject
 
     options = _options(config)
     request = Request(config.data, Path(config.data_root), config.body)
-    subjects = list(scan_subjects(request)) if config.subject == "all" else [config.subject]
+    subjects = list(_without_poses(request, config.overwrite)) if config.subject == "all" else [config.subject]
     if not subjects:
         raise UserError(f"no scans in {request.folder}; wanted meshes/<subject>/<sequence>/ with one file per frame")
     is_whole = [fit_subject(subject, request, options) for subject in subjects]
     settings = f"data=meshes subject={subjects[0]}" + (f" data.folder={config.data.folder}" if config.data.folder else "")
     log.info('next: "snarf preprocess %s", then "snarf train %s training.refine_poses=true"', settings, settings)
     return 0 if all(is_whole) else 1
+
+
+def _without_poses(request: Request, overwrite: bool) -> Iterator[str]:
+    """Yield the subjects that have scans and no skeleton or poses of others."""
+    from snarfcli.registration.scans import find_scans, scan_subjects
+    from snarfcli.registration.written import foreign_files
+
+    for subject in scan_subjects(request):
+        try:
+            place, folders = find_scans(subject, request)
+        except UserError as error:  # a rigged file
+            log.warning("left out: %s", error)
+            continue
+        if not overwrite and foreign_files(place, [folder.folder for folder in folders]):
+            log.warning("left out: subject %s, which has a skeleton or poses that snarf fit has not written", subject)
+        else:
+            yield subject
 
 
 def _options(config: FitConfig) -> FitOptions:

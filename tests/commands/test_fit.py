@@ -213,6 +213,19 @@ def test_files_of_others_are_kept(tmp_path: Path, me: Path, quick: pytest.Monkey
     assert _files(me) == {"skeleton.npz", "fit.json", "fit.png", "run/poses.npz", "walk/poses.npz"}
 
 
+def test_all_leaves_out_subjects_with_poses_of_others(
+    tmp_path: Path, me: Path, quick: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (me / "skeleton.json").write_text("{}")
+    with pytest.raises(UserError, match="no scans in"):
+        fit.run(_config(tmp_path, subject="all"))
+    assert "left out: subject me, which has a skeleton or poses that snarf fit has not written" in caplog.text
+    write_scans(tmp_path / "meshes" / "you" / "walk", 2, one_topology=True)
+    fit.run(_config(tmp_path, subject="all"))
+    assert _files(me) == {"skeleton.json"}
+    assert "walk/poses.npz" in _files(tmp_path / "meshes" / "you")
+
+
 def test_broken_scans_stop_the_fit_or_are_not_trusted(
     tmp_path: Path, me: Path, quick: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -28,6 +28,7 @@ __all__ = ["Worker", "choose_processes", "count_cores", "end_workers", "parse_pr
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 _MOST_PROCESSES = 64
+_START_METHODS = ("fork", "forkserver", "spawn")
 
 
 def count_cores() -> int:
@@ -104,7 +105,7 @@ class Worker:
         work = pickle.dumps((function, task))  # here, so that a failure to read it there is reported like any other
         self._process = context.Process(target=_serve, args=(theirs, has_requests, _Locks()), daemon=True)
         self._fewer = fewer
-        with _one_thread(), safe_imports():
+        with _one_thread(), _standard_start_method(), safe_imports():
             self._process.start()
         theirs.close()
         try:  # not among the arguments: `start` would wait for ever for a process that has ended before it has read them
@@ -264,6 +265,20 @@ def _requests(connection: Connection) -> Iterator[Any]:
         except (EOFError, ConnectionResetError):
             return
         yield request
+
+
+@contextlib.contextmanager
+def _standard_start_method() -> Iterator[None]:
+    """Start processes that know the start method of this one: joblib's own processes have one that others do not know."""
+    before = multiprocessing.get_start_method(allow_none=True)
+    if before in (None, *_START_METHODS):
+        yield
+        return
+    multiprocessing.set_start_method("spawn", force=True)
+    try:
+        yield
+    finally:
+        multiprocessing.set_start_method(before, force=True)
 
 
 @contextlib.contextmanager

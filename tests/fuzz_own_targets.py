@@ -257,6 +257,96 @@ def refined_poses() -> Target:
     return Target("refined_poses", ".npz", seeds, read, damaged_npz, 0.8)
 
 
+def _fitted(folder: Path) -> Any:
+    """Write the files of a fit, and return what they were made from."""
+    from toy_scans import BETAS, toy_poses
+
+    from snarfcli.bodies import builtin_body
+    from snarfcli.datasets.recorded_sequence import FileToWorld
+    from snarfcli.registration.written import FitMade, FittedFile, write_fitted, write_skeleton
+
+    made = FitMade(BETAS, FileToWorld(0.01, "z"), {"seed": 0})
+    poses, places = toy_poses(2)
+    fitted = FittedFile(poses, places, np.array([0.01, np.nan]), np.array([True, False]), ("", "damaged"), "abc", 1.0)
+    write_skeleton(folder, builtin_body().skeleton(BETAS), made)
+    write_fitted(folder, fitted, made, 30.0)
+    return made, fitted
+
+
+def fitted_skeleton() -> Target:
+    """The skeleton that `snarf fit` has written, which it continues."""
+    from tree_damage import damaged_npz
+
+    from snarfcli.registration.written import foreign_files, read_made
+
+    def seeds() -> list[bytes]:
+        with tempfile.TemporaryDirectory() as folder:
+            _fitted(Path(folder))
+            return [(Path(folder) / "skeleton.npz").read_bytes()]
+
+    def unpack(content: bytes, scratch: Path) -> Path:
+        scratch.mkdir()
+        (scratch / "skeleton.npz").write_bytes(content)
+        return scratch
+
+    def read(folder: Path) -> object:
+        foreign_files(folder, [folder])
+        made = read_made(folder)
+        assert made is None or made.digest
+        return made
+
+    return Target("fitted_skeleton", ".npz", seeds, read, damaged_npz, unpack=unpack)
+
+
+def fitted_poses() -> Target:
+    """The poses that `snarf fit` has written, which it keeps and reports."""
+    from tree_damage import damaged_npz
+
+    from snarfcli.bodies import builtin_body
+    from snarfcli.registration.fit_report import SequenceReport
+    from snarfcli.registration.written import read_fitted
+
+    with tempfile.TemporaryDirectory() as folder:
+        made, _ = _fitted(Path(folder))
+        content = (Path(folder) / "poses.npz").read_bytes()
+
+    def unpack(content: bytes, scratch: Path) -> Path:
+        scratch.mkdir()
+        (scratch / "poses.npz").write_bytes(content)
+        return scratch
+
+    def read(folder: Path) -> object:
+        fitted = read_fitted(folder, made, 24)
+        if fitted is not None:
+            report = SequenceReport("walk", 0, fitted, builtin_body().joint_names)
+            assert report.line().isprintable()
+            json.dumps(report.content, allow_nan=False)
+        return fitted
+
+    return Target("fitted_poses", ".npz", lambda: [content], read, damaged_npz, unpack=unpack)
+
+
+def fit_report() -> Target:
+    """The report of `snarf fit`, which `snarf doctor` reads."""
+    from tree_damage import damaged_json
+
+    from snarfcli.bodies import builtin_body
+    from snarfcli.registration.fit_report import SequenceReport, report_remarks, write_fit_report
+
+    with tempfile.TemporaryDirectory() as folder:
+        made, fitted = _fitted(Path(folder))
+        report = SequenceReport("walk", 0, fitted, builtin_body().joint_names)
+        write_fit_report(Path(folder) / "fit.json", {"subject": "me"}, made, [report], is_complete=True)
+        content = (Path(folder) / "fit.json").read_bytes()
+
+    def read(path: Path) -> object:
+        remarks = report_remarks(path)
+        assert all(remark.text.isprintable() for remark in remarks)
+        return remarks
+
+    return Target("fit_report", ".json", lambda: [content], read, _any_json(damaged_json))
+
+
 def animation_record() -> Target:
     """The record of an animation in its folder."""
     from tree_damage import damaged_json
@@ -397,6 +487,7 @@ def mesh_obj() -> Target:
     return _mesh_target("mesh_obj", ".obj")
 
 
-OWN_TARGETS = (avatar, avatar_use, checkpoint, samples, resumed_samples, refined_poses, animation_record, planned_job,
+OWN_TARGETS = (avatar, avatar_use, checkpoint, samples, resumed_samples, refined_poses, fitted_skeleton, fitted_poses,
+               fit_report, animation_record, planned_job,
                job_status, durations, metrics, mesh_ply, mesh_obj)  # fmt: skip
 """Functions that each return one target with the name of the function."""

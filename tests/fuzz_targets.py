@@ -335,6 +335,60 @@ def surface_gltf() -> Target:
     return Target("surface_gltf", ".gltf", base.seeds, read_gltf_surface, base.extra)
 
 
+def _point_target(name: str, suffix: str, seeds: Callable[[], list[bytes]], extra=None) -> Target:
+    from snarfcli.point_clouds import read_frame
+
+    return Target(name, suffix, seeds, read_frame, extra)
+
+
+@_target
+def points_text() -> Target:
+    return _point_target(
+        "points_text",
+        ".xyz",
+        lambda: [
+            b"3\nmade by hand\n0 0 0 255 0 0 0 0 1\n1 0 0 255 0 0 0 1 0\n0 1 0 0 0 0 1 0 0\n",
+            b"x,y,z,nx,ny,nz\r\n0,0,1,0,0,1\r\n0,1,0,0,1,0\r\n# end\r\n",
+            b"// points\n1e-3;2;3\n4;5;6\n-7;.8;9",
+        ],
+    )
+
+
+@_target
+def points_ply() -> Target:
+    import struct
+
+    def seeds() -> list[bytes]:
+        names = b"".join(b"property float %s\n" % name for name in (b"x", b"y", b"z", b"nx", b"ny", b"nz"))
+        head = b"ply\nformat %s 1.0\nelement vertex 3\n" + names + b"end_header\n"
+        numbers = [float(number % 5) for number in range(18)]
+        text = b"\n".join(b" ".join(b"%g" % value for value in numbers[row : row + 6]) for row in (0, 6, 12))
+        return [head % b"ascii" + text, head % b"binary_little_endian" + struct.pack("<18f", *numbers)]
+
+    return _point_target("points_ply", ".ply", seeds)
+
+
+@_target
+def points_obj() -> Target:
+    lines = b"v 0 0 1 1 0 0\nvn 0 0 1\nv 0 1 0\nvn 0 1 0\n"
+    return _point_target("points_obj", ".obj", lambda: [lines, b"# x\r\n" + lines + b"v 1 \\\n0 0\n"])
+
+
+@_target
+def points_npz() -> Target:
+    import io
+
+    def seeds() -> list[bytes]:
+        points, made = _poses(4, 3), []
+        for arrays in ({"points": points, "normals": points}, {"vertices": points.astype("f8")}, {"xyz": _poses(3, 6)}):
+            buffer = io.BytesIO()
+            np.savez(buffer, **arrays)
+            made.append(buffer.getvalue())
+        return made
+
+    return _point_target("points_npz", ".npz", seeds, _odd_npz)
+
+
 def _poses(frames: int, width: int):
 
     return np.linspace(-0.5, 0.5, frames * width, dtype=np.float32).reshape(frames, width)

@@ -23,7 +23,7 @@ LAYERS = (
     ("datasets", "meshing"),
     ("models", "motions"),
     ("deformer", "shape"),
-    ("bodies", "draws", "networks"),
+    ("bodies", "draws", "networks", "point_clouds"),
     (
         "array_files",
         "checks",

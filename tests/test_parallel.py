@@ -170,3 +170,16 @@ def test_number_of_processes() -> None:
     assert choose_processes(1000, 1) == min(count_cores(), 64)
     assert choose_processes(5, 1, least_tasks=6) == 1
     assert choose_processes(1000, 2**60) == 1
+
+
+def _squares(value: int) -> Iterator[int]:
+    yield value * value
+
+
+def _in_processes(value: int) -> list[tuple[int, int]]:
+    return list(run_in_processes(_squares, [(value,)], 1))
+
+
+def test_processes_of_joblib_can_start_processes():
+    joblib = pytest.importorskip("joblib")
+    assert joblib.Parallel(n_jobs=2)(joblib.delayed(_in_processes)(value) for value in (2, 3)) == [[(0, 4)], [(0, 9)]]

@@ -10,14 +10,12 @@ import torch
 import trimesh
 
 from snarfcli.bodies import builtin_body
-from snarfcli.datasets.registry import find_dataset
-from snarfcli.datasets.settings import DataConfig
-from snarfcli.datasets.sources import Request
 from snarfcli.registration.body_surface import BodyState, BodySurface
 from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.solver import PosePrior, agreement, fit_state, scales
 from snarfcli.registration.starts import Found, PoseFinder
+from snarfcli.registration.written import read_fitted, read_made
 from snarfcli.sampling import oriented_surface_samples
 
 BETAS = np.array([1.0, -0.8, 0.5, 0.7, 0, 0, 0, 0, 0, 0])
@@ -45,14 +43,25 @@ def toy_mesh(pose: np.ndarray, place: np.ndarray, betas: np.ndarray = BETAS) -> 
 
 
 def write_scans(
-    folder: Path, frames: int = 2, *, phase: float = 0.0, unit_m: float = 1.0, up: str = "y", betas: np.ndarray = BETAS
+    folder: Path,
+    frames: int = 2,
+    *,
+    phase: float = 0.0,
+    unit_m: float = 1.0,
+    up: str = "y",
+    betas: np.ndarray = BETAS,
+    one_topology: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Write one mesh per frame, and return the poses and places."""
+    """Write one mesh per frame, and return the poses and places.
+
+    Without `one_topology`, every mesh lacks other faces.
+    """
     folder.mkdir(parents=True)
     poses, places = toy_poses(frames, phase)
     for frame in range(frames):
         vertices, faces = toy_mesh(poses[frame], places[frame], betas)
         vertices = (vertices if up == "y" else vertices @ Z_UP.T) / unit_m
+        faces = faces if one_topology else np.delete(faces, 500 + 20 * frame, 0)
         trimesh.Trimesh(vertices, faces, process=False).export(folder / f"{frame}.ply")
     return poses, places
 
@@ -111,20 +120,15 @@ class QuickFinder(PoseFinder):
         return Found(state, agreement(self.surface, state, scan))
 
 
-def joint_error_mm(root: Path, truth: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
-    """Return the mean distance between the joints of a fitted subject `me` and the true ones by sequence, millimetres.
-
-    Sequences of which the data set holds back the end are compared as far as they go.
-    """
-    data = find_dataset("meshes").load("me", Request(DataConfig("meshes", 1, 1, 1), root))
-    assert not data.broken
-    skeleton, errors = data.skeleton.to(torch.float64), {}
-    for spec in data.sequences:
-        if spec.name not in truth:
-            continue
-        poses, places = (torch.from_numpy(array[: spec.motion.num_frames]) for array in truth[spec.name])
-        wanted = builtin_body().pose(poses, BETAS, places).joints.double()
-        moved = skeleton.posed_from_rest(torch.from_numpy(spec.motion.poses), torch.from_numpy(spec.motion.translation))
-        joints = torch.einsum("tjab,jb->tja", moved[..., :3, :3], skeleton.joints_rest) + moved[..., :3, 3]
-        errors[spec.name] = 1000 * float((joints - wanted).norm(dim=2).mean())
+def joint_error_mm(place: Path, truth: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
+    """Return the mean distance between the fitted joints of a subject and the true ones by sequence, millimetres."""
+    made = read_made(place)
+    assert made is not None
+    errors = {}
+    for name, (poses, places) in truth.items():
+        fitted = read_fitted(place / name, made, 24)
+        assert fitted is not None
+        body = builtin_body().to(torch.float64)
+        found = body.pose(fitted.poses, made.betas, fitted.translation).joints
+        errors[name] = 1000 * float((found - body.pose(poses, BETAS, places).joints).norm(dim=2).mean())
     return errors

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 
 if TYPE_CHECKING:
+    from snarfcli.datasets.sources import Request
     from snarfcli.registration.fit_options import FitOptions
 
 __all__ = ["FitConfig", "run"]
@@ -43,6 +45,9 @@ class FitConfig:
     """Data folder; scans are read from <data_root>/meshes/<subject>/<sequence>, or from data.folder."""
     body: str | None = MISSING
     """Body model file in SMPL's format, or a folder with it; null for the built-in body."""
+    skeleton: str | None = MISSING
+    """A rig to fit in place of a body, such as an animal: a .glb with a skin, or a skeleton file with the mesh of the same name
+    beside it; null for none."""
     gender: str = MISSING
     """Of the body model in a folder: neutral, female or male."""
     clothes: str = MISSING
@@ -76,18 +81,34 @@ def run(config: FitConfig) -> int:
         OSError: the data folder cannot be written to, or the disk is full.
     """
     from snarfcli.datasets.sources import Request
-    from snarfcli.registration.scans import scan_subjects
     from snarfcli.registration.subject_fit import fit_subject
 
     options = _options(config)
     request = Request(config.data, Path(config.data_root), config.body)
-    subjects = list(scan_subjects(request)) if config.subject == "all" else [config.subject]
+    subjects = list(_without_poses(request, config.overwrite)) if config.subject == "all" else [config.subject]
     if not subjects:
         raise UserError(f"no scans in {request.folder}; wanted meshes/<subject>/<sequence>/ with one file per frame")
     is_whole = [fit_subject(subject, request, options) for subject in subjects]
     settings = f"data=meshes subject={subjects[0]}" + (f" data.folder={config.data.folder}" if config.data.folder else "")
     log.info('next: "snarf preprocess %s", then "snarf train %s training.refine_poses=true"', settings, settings)
     return 0 if all(is_whole) else 1
+
+
+def _without_poses(request: Request, overwrite: bool) -> Iterator[str]:
+    """Yield the subjects that have scans and no skeleton or poses of others."""
+    from snarfcli.registration.scans import find_scans, scan_subjects
+    from snarfcli.registration.written import foreign_files
+
+    for subject in scan_subjects(request):
+        try:
+            place, folders = find_scans(subject, request)
+        except UserError as error:  # a rigged file
+            log.warning("left out: %s", error)
+            continue
+        if not overwrite and foreign_files(place, [folder.folder for folder in folders]):
+            log.warning("left out: subject %s, which has a skeleton or poses that snarf fit has not written", subject)
+        else:
+            yield subject
 
 
 def _options(config: FitConfig) -> FitOptions:
@@ -107,10 +128,12 @@ def _options(config: FitConfig) -> FitOptions:
     check_number("points_per_frame", config.points_per_frame, *_POINTS)
     check_number("frame_rate", config.frame_rate, *_FRAME_RATES)
     check_number("seed", config.seed, 0)
+    if config.body is not None and config.skeleton is not None:
+        raise UserError("body, skeleton: wanted at most one of them, got both; leave one out")
     if config.workers < 0:
         raise UserError(f"workers: wanted a number of processes, or 0 for one per core, got {config.workers}")
     return FitOptions(
-        BodyChoice(config.body, config.gender),
+        BodyChoice(config.body, config.gender, config.skeleton),
         config.data.scale,
         config.data.up,
         _clothes_m(config.clothes),

@@ -106,7 +106,7 @@ def _about(data: SubjectData, seen: list[ExaminedFrame]) -> Iterator[Remark]:
         if not (np.isfinite(spec.motion.poses).all() and np.isfinite(spec.motion.translation).all()):
             yield Remark(spec.name, "wanted finite poses, got NaN or infinity; repair them", "problem")
             continue
-        usable = np.arange(spec.motion.num_frames) if spec.frames is None else spec.frames
+        usable = spec.every(1)
         for frame in usable[np.unique(np.linspace(0, len(usable) - 1, _EXAMINED_FRAMES).round().astype(int))]:
             label = f"{spec.name}, frame {frame}"
             try:

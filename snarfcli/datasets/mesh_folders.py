@@ -7,7 +7,7 @@ from pathlib import Path
 from snarfcli.datasets.rigged import RIG_SUFFIXES
 from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError, nearest
-from snarfcli.formats.surfaces import list_surfaces
+from snarfcli.point_clouds import list_frames
 
 __all__ = [
     "POSE_FILES",
@@ -15,6 +15,7 @@ __all__ = [
     "WANTED",
     "files_with",
     "find_subject",
+    "frame_files",
     "meshes_folder",
     "missing_parts",
     "pose_file",
@@ -93,7 +94,7 @@ def missing_parts(folder: Path) -> str:
         return ""
     missing = f"{folder} has no skeleton: wanted skeleton.json, .npz or .bvh, a rigged .glb, or motion.bvh in its sequences"
     fits = f'; for scans of a person, "snarf fit data=meshes subject={folder.name}" makes skeleton and poses'
-    return missing + (fits if any(map(list_surfaces, inside)) else "")
+    return missing + (fits if any(map(frame_files, inside)) else "")
 
 
 def subfolders(folder: Path) -> list[Path]:
@@ -104,6 +105,11 @@ def subfolders(folder: Path) -> list[Path]:
 def files_with(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """Return the files in a folder that have one of some suffixes, sorted by name."""
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file())
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """Return the files of the frames of a sequence, meshes or points, in natural order, without its poses and skeleton."""
+    return list_frames(folder, {*POSE_FILES, *_NO_POSES})
 
 
 def skeleton_files(folder: Path) -> list[Path]:

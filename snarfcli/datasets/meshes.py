@@ -14,14 +14,15 @@ A skeleton and one folder per sequence:
 
     fox/skeleton.json           a skeleton: names, parents, joints_rest (see skeleton_files); or skeleton.npz, or skeleton.bvh
     fox/<sequence>/poses.npz    poses or bone transforms, one per frame; or poses.json, or motion.bvh
-    fox/<sequence>/*.obj        the posed meshes, one file per frame in the order of their names (.ply, .off, .stl, .glb, ...)
+    fox/<sequence>/*.obj        the posed meshes, one file per frame in the order of their names (.ply, .off, .stl, .glb, ...);
+                                or points, around which surfaces are closed (.ply, .obj, .xyz, .npy, ...)
 
 A single sequence, whose poses and meshes are in the same folder as the skeleton:
 
     fox/skeleton.json, fox/poses.npz, fox/*.obj
 
 If there is no skeleton file, the skeleton is read from the motion.bvh of a sequence. The numbers of vertices and faces may
-differ between frames.
+differ between frames. Frames that a pose file does not trust are left out, unless data.untrusted is set.
 
 Held-out sequences are listed, by name or pattern, in `fox/split.json`, or in data.test and data.ood. Otherwise, sequences
 whose names start with `ood` are out of distribution, and the last fifth of the others (at least one) is for testing;
@@ -33,6 +34,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -43,11 +45,13 @@ from numpy.typing import NDArray
 from snarfcli.bodies.skeleton import Skeleton, legs_apart_pose
 from snarfcli.bodies.template import MeshTemplate
 from snarfcli.checks import check_choice
+from snarfcli.datasets.frame_surfaces import read_frame_surface, read_frame_vertices
 from snarfcli.datasets.mesh_folders import (
     POSE_SUFFIXES,
     WANTED,
     files_with,
     find_subject,
+    frame_files,
     meshes_folder,
     missing_parts,
     pose_file,
@@ -67,7 +71,6 @@ from snarfcli.datasets.splits import SPLITS
 from snarfcli.datasets.subject_size import subject_length
 from snarfcli.datasets.subjects import SubjectData
 from snarfcli.errors import UserError
-from snarfcli.formats.surfaces import list_surfaces, read_surface
 from snarfcli.names import folder_names
 from snarfcli.texts import counted
 
@@ -107,24 +110,27 @@ def load(subject: str, request: Request) -> SubjectData:
 # ---------------------------------------------------------------- one mesh file per frame
 def _load_meshes(subject: str, folder: Path, config: DataConfig) -> SubjectData:
     """Read a subject that has a skeleton and one mesh file per frame."""
-    sequences = [path for path in subfolders(folder) if list_surfaces(path) or files_with(path, POSE_SUFFIXES)]
+    sequences = [path for path in subfolders(folder) if frame_files(path) or files_with(path, POSE_SUFFIXES)]
     sequences = sequences or [folder]
     source, skeleton = _read_skeleton(folder, sequences)
     recordings, broken = [], []
     names = folder_names(path.name if path != folder else subject for path in sequences)
     for name, path in zip(names, sequences, strict=True):
         try:
-            recordings.append(_read_recording(name, path, skeleton))
+            recordings.append(_read_recording(name, path, skeleton, use_all=config.untrusted))
         except UserError as error:
             broken.append((name, str(error)))
     if not recordings:
         more = f" (and {len(broken) - 1} more sequences cannot be used)" if broken[1:] else ""
         raise UserError(broken[0][1] + more)
-    length, whole = subject_length(*_first_mesh(recordings, skeleton), skeleton.parents)
+    vertices, joints, is_cloud = _first_mesh(recordings, skeleton)
+    length, whole = subject_length(vertices, joints, skeleton.parents)
     scale, why = person_scale(length, whole, config.scale, skeleton.scale)
     up = config.up if config.up != "auto" else skeleton.up or "y"
     warnings = _about_angles(recordings)
     sources = (f"skeleton {source}, {counted(len(skeleton.names), 'joint')}", _conversion_text(why, up))
+    sources += ("points without faces: a closed surface is put around those of each frame",) if is_cloud else ()
+    sources += _about_trust(recordings)
     return _subject(
         subject, skeleton, FileToWorld(scale, up), recordings, folder, config, sources, warnings, broken=tuple(broken)
     )
@@ -143,15 +149,37 @@ def _read_skeleton(folder: Path, sequences: list[Path]) -> tuple[Path, SkeletonF
     return path, bvh_skeleton(path) if path.suffix == ".bvh" else read_skeleton(path)
 
 
-def _read_recording(name: str, folder: Path, skeleton: SkeletonFile) -> RecordedSequence:
-    """Read the poses of one sequence, and list its mesh files, which are not read yet."""
+def _read_recording(name: str, folder: Path, skeleton: SkeletonFile, *, use_all: bool) -> RecordedSequence:
+    """Read the poses of one sequence, and list its mesh files, which are not read yet.
+
+    Args:
+        name: name of the sequence.
+        folder: its folder.
+        skeleton: skeleton of the subject.
+        use_all: use also frames that the pose file does not trust.
+    """
     path = pose_file(folder)
     poses = bvh_poses(path, skeleton) if path.suffix.lower() == ".bvh" else read_poses(path, skeleton.order)
-    meshes = list_surfaces(folder)
+    meshes = [file for file in frame_files(folder) if file != path]
     if len(meshes) != poses.num_frames:
         wanted = f"{poses.num_frames} meshes, one per frame of {path.name}"
         raise UserError(f"{folder}: wanted {wanted}, got {len(meshes)}; add or remove files")
-    return RecordedSequence(name, poses, FileMeshes(meshes, read_surface, np.eye(4)))
+    if use_all:
+        poses = replace(poses, is_trusted=None)
+    if poses.is_trusted is not None and not poses.is_trusted.any():
+        raise UserError(f"{path}: none of its {counted(poses.num_frames, 'frame')} is trusted; data.untrusted=true uses them")
+    return RecordedSequence(name, poses, FileMeshes(meshes, read_frame_surface, np.eye(4)))
+
+
+def _about_trust(recordings: list[RecordedSequence]) -> tuple[str, ...]:
+    """Return a line about the frames that are left out because their poses are not trusted."""
+    counts = {each.name: (each.poses.num_frames - len(each.usable_frames), each.poses.num_frames) for each in recordings}
+    some = [f"{name} {count} of {frames}" for name, (count, frames) in counts.items() if count]
+    if not some:
+        return ()
+    listed = ", ".join(some[:12]) + (", ..." if some[12:] else "")
+    total = counted(sum(count for count, _ in counts.values()), "frame")
+    return (f"{total} left out, whose poses are not trusted ({listed}); data.untrusted=true uses them",)
 
 
 def _about_angles(recordings: list[RecordedSequence]) -> tuple[str, ...]:
@@ -167,17 +195,18 @@ def _about_angles(recordings: list[RecordedSequence]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _first_mesh(recordings: list[RecordedSequence], skeleton: SkeletonFile) -> tuple[NDArray, NDArray]:
-    """Return the vertices [V, 3] and joints [J, 3], units of the file, of the first frame of a sequence.
+def _first_mesh(recordings: list[RecordedSequence], skeleton: SkeletonFile) -> tuple[NDArray, NDArray, bool]:
+    """Return the vertices or points [V, 3] and joints [J, 3], units of the file, of the first usable frame of a sequence.
 
-    Sequences are tried in order until one has a first mesh that can be read.
+    The last value is whether they are points only. Sequences are tried in order until one has a first mesh that can be read.
     """
     problem = None
     for recording in recordings:
         try:
-            vertices, _ = recording.meshes[0]
+            frame = int(recording.usable_frames[0])
+            vertices, is_cloud = read_frame_vertices(Path(recording.meshes.source(frame)))
             if len(vertices) and np.isfinite(vertices).all():
-                return vertices, recording.joints(0, skeleton)
+                return vertices, recording.joints(frame, skeleton), is_cloud
         except UserError as error:
             problem = problem or error
     raise problem or UserError(f"the first meshes of all {len(recordings)} sequences are empty or not finite; repair them")

@@ -100,6 +100,16 @@ class NamedValues:
             self.fail(f"{name}: {wanted}, got NaN, infinity or larger ones{where}; repair them")
         return array
 
+    def flags(self, name: str, count: int) -> NDArray[np.bool_] | None:
+        """Return `count` truth values, None if there are none."""
+        value = self.get(name)
+        if value is None:
+            return None
+        array = np.array(value) if isinstance(value, list) and all(type(flag) is bool for flag in value) else value
+        if not isinstance(array, np.ndarray) or array.dtype.kind != "b" or array.shape != (count,):
+            self.fail(f"{name}: wanted {count} values true or false, got other values; repair it")
+        return array
+
     def text(self, name: str) -> str | None:
         """Return a short text, None if there is none."""
         value = self.get(name)

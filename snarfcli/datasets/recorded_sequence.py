@@ -76,6 +76,12 @@ class RecordedSequence:
     meshes: FileMeshes | RigMeshes
     """The mesh of every frame: files, which are converted when they are read, or a rig that is already converted."""
 
+    @property
+    def usable_frames(self) -> NDArray[np.int64]:
+        """[K], indices of the frames whose poses are trusted."""
+        is_trusted = self.poses.is_trusted
+        return np.arange(self.poses.num_frames) if is_trusted is None else np.flatnonzero(is_trusted)
+
     def bone_transforms(self, frames: NDArray[np.int64], skeleton: SkeletonFile) -> NDArray[np.float64]:
         """Return the transforms [K, J, 4, 4] of the bones from rest to the frames with these indices [K], units of the file."""
         if self.poses.posed_from_rest is not None:
@@ -108,18 +114,18 @@ class RecordedSequence:
         meshes = self.meshes
         if isinstance(meshes, FileMeshes):
             meshes = replace(meshes, world_from_file=world.matrix)
-        return SequenceSpec(self.name, split, motion, meshes, posed_from_rest)
+        return SequenceSpec(self.name, split, motion, meshes, posed_from_rest, is_usable=poses.is_trusted)
 
     def split_off_test(self) -> list[RecordedSequence]:
-        """Return the sequence without its last fifth, and the last fifth; a single frame is not split."""
-        count = self.poses.num_frames
-        if count < 2:
+        """Return the sequence without the last fifth of its usable frames, and with these; a single frame is not split."""
+        count, usable = self.poses.num_frames, self.usable_frames
+        if len(usable) < 2:
             return [self]
-        cut = held_back_start(count)
+        cut = int(usable[held_back_start(len(usable))])
         return [self._part(self.name, slice(0, cut)), self._part(f"{self.name}_end", slice(cut, count))]
 
     def _part(self, name: str, frames: slice) -> RecordedSequence:
-        arrays = {key: getattr(self.poses, key) for key in ("poses", "translation", "posed_from_rest")}
+        arrays = {key: getattr(self.poses, key) for key in ("poses", "translation", "posed_from_rest", "is_trusted")}
         poses = replace(self.poses, **{key: array[frames] for key, array in arrays.items() if array is not None})
         if isinstance(self.meshes, FileMeshes):
             return RecordedSequence(name, poses, replace(self.meshes, paths=self.meshes.paths[frames]))

@@ -96,8 +96,8 @@ def split_patterns(place: Path, config: DataConfig) -> tuple[list[str], list[str
 
 
 def _points(recording: RecordedSequence, skeleton: SkeletonFile) -> np.ndarray:
-    count = recording.poses.num_frames
-    frames = np.unique(np.linspace(0, count - 1, min(count, _COMPARED_FRAMES)).round().astype(int))
+    usable = recording.usable_frames
+    frames = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _COMPARED_FRAMES)).round().astype(int))]
     return pose_points(recording.bone_transforms(frames, skeleton), skeleton.joints_rest, skeleton.parents)
 
 

@@ -35,5 +35,7 @@ class DataConfig:
     """Metres per unit of the files, for meshes; auto: 1 for a subject of a person's size, else what gives it that size."""
     up: str = "auto"
     """Up axis of the files: auto, y or z, for amass and meshes; also x, -x, -y or -z, for amass."""
+    untrusted: bool = False
+    """Use also frames whose pose file says that their poses are not to be trusted (snarf fit), for meshes."""
     canonical: str = "auto"
     """Canonical pose, for meshes: rest; legs_apart (SNARF's, if rest is a T-pose); auto (from the skeleton file, else rest)."""

@@ -15,6 +15,7 @@ A pose file has the same form, with one of the first two entries:
     bone_transforms  [T, J, 4, 4]  transforms from the rest pose to the posed frame of each joint; column vectors
     trans            [T, 3]        with poses, optional: offset of the first root from its rest position
     frame_rate       number        optional: frames per second, 30 if not given
+    trusted          [T]           optional: whether each pose can be trusted; others are left out (`snarf fit` writes this)
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ _ALIASES = {
     "poses": ("poses", "pose"),
     "bone_transforms": ("bone_transforms",),
     "trans": ("trans", "translation"),
+    "trusted": ("trusted",),
     "frame_rate": ("frame_rate", "mocap_framerate", "mocap_frame_rate", "fps"),
 }
 
@@ -84,6 +86,8 @@ class PoseFile:
     """[T, 3], units of the file."""
     posed_from_rest: NDArray[np.float64] | None = None
     """[T, J, 4, 4], bone transforms, units of the file."""
+    is_trusted: NDArray[np.bool_] | None = None
+    """[T]; None if the file trusts all."""
 
     @property
     def num_frames(self) -> int:
@@ -149,7 +153,8 @@ def read_poses(path: str | Path, order: NDArray[np.int64]) -> PoseFile:
             content.fail("wanted at least 1 frame, got 0; give another file")
         if np.abs(transforms[..., 3, :] - (0, 0, 0, 1)).max() > 1e-4:
             content.fail("bone_transforms: wanted last rows 0 0 0 1, got others; transpose them if they are for row vectors")
-        return PoseFile(frame_rate, posed_from_rest=transforms[:, order])
+        is_trusted = content.flags("trusted", len(transforms))
+        return PoseFile(frame_rate, posed_from_rest=transforms[:, order], is_trusted=is_trusted)
     if content.get("poses") is None:
         content.fail("has neither poses nor bone_transforms; see data/README.md")
     poses = content.numbers("poses", (None, count, 3))
@@ -163,7 +168,7 @@ def read_poses(path: str | Path, order: NDArray[np.int64]) -> PoseFile:
         translation = content.numbers("trans", (None, 3))
         if len(translation) != len(poses):
             content.fail(f"trans: wanted {len(poses)} rows, one per pose, got {len(translation)}; repair it")
-    return PoseFile(frame_rate, poses[:, order], translation)
+    return PoseFile(frame_rate, poses[:, order], translation, is_trusted=content.flags("trusted", len(poses)))
 
 
 def _names(content: NamedValues, count: int) -> list[str]:

@@ -32,6 +32,17 @@ class SequenceSpec:
     """[T, J, 4, 4], bone transforms, metres; None if they follow from `motion`, that is, if no joint moves or stretches."""
     frames: NDArray[np.int64] | None = None
     """[K], indices of the frames to use, if the data set chooses them; None to use every n-th frame, as in the settings."""
+    is_usable: NDArray[np.bool_] | None = None
+    """[T], whether each frame may be used; None if all may."""
+
+    def every(self, step: int) -> NDArray[np.int64]:
+        """Return the indices [K] of the frames to use: those that the data set chooses, or the first usable of every `step`."""
+        if self.frames is not None:
+            return np.asarray(self.frames, np.int64)
+        if self.is_usable is None:
+            return np.arange(0, self.motion.num_frames, step)
+        usable = np.flatnonzero(self.is_usable)
+        return usable[np.unique(usable // step, return_index=True)[1]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_FACES", "Surface", "add_fan", "parse_obj", "parse_stl", "surface_of", "text_lines"]
+__all__ = ["MAX_FACES", "Surface", "add_fan", "obj_lines", "parse_obj", "parse_stl", "surface_of", "text_lines"]
 
 Surface = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices [V, 3] and faces [F, 3]; the indices in faces are not yet checked."""
@@ -53,7 +53,7 @@ def add_fan(corners: array, polygon: Sequence[int]) -> None:
 def parse_obj(content: bytes) -> Surface:
     """Parse the `v` and `f` lines of an OBJ file; other lines (texture coordinates, materials, curves) are skipped."""
     positions, corners = array("d"), array("q")
-    for words in text_lines(_CONTINUED.sub(b" ", content) if b"\\" in content else content):
+    for words in obj_lines(content):
         if words[0] == b"v":
             if len(words) < 4:
                 raise ValueError(f"a vertex: wanted 3 coordinates, got {len(words) - 1}")
@@ -64,6 +64,11 @@ def parse_obj(content: bytes) -> Surface:
             # 1 is the first vertex of the file, -1 the last vertex before this line; 0 is invalid.
             add_fan(corners, [i - 1 if i > 0 else count + i if i < 0 else -1 for i in polygon])
     return surface_of(positions, corners)
+
+
+def obj_lines(content: bytes) -> Iterator[list[bytes]]:
+    """Yield the words of each line of an OBJ file as `text_lines` does; a backslash joins a line with the next."""
+    return text_lines(_CONTINUED.sub(b" ", content) if b"\\" in content else content)
 
 
 def parse_stl(content: bytes) -> Surface:

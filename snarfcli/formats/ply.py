@@ -1,4 +1,4 @@
-"""Parse the triangles of PLY files, text or binary, from their bytes; polygons are cut into fans.
+"""Parse the triangles or the points of PLY files, text or binary, from their bytes; polygons are cut into fans.
 
 `plain_meshes.py` says why trimesh does not read these files.
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,21 @@ from numpy.typing import NDArray
 from snarfcli.formats.plain_meshes import MAX_FACES, Surface, add_fan
 from snarfcli.formats.ply_header import PlyElement, PlyHeader, read_ply_header
 
-__all__ = ["parse_ply"]
+__all__ = ["PlyContent", "parse_ply", "read_ply"]
 
 _INDICES = ("vertex_indices", "vertex_index")
+
+
+@dataclass(frozen=True, eq=False)
+class PlyContent:
+    """What is read of a file; the indices in faces are not yet checked."""
+
+    vertices: NDArray[np.float64]
+    """[V, 3]."""
+    faces: NDArray[np.int64]
+    """[F, 3]; F is 0 for a point cloud."""
+    normals: NDArray[np.float64] | None
+    """[V, 3], of any length; None if the file has none."""
 
 
 class _Found:
@@ -27,6 +40,7 @@ class _Found:
 
     def __init__(self) -> None:
         self.vertices: NDArray[np.float64] = np.zeros((0, 3))
+        self.normals: NDArray[np.float64] | None = None
         self.positions = array("d")
         """Coordinates of vertices that also have lists, one after another."""
         self.corners = array("q")
@@ -44,10 +58,10 @@ class _Found:
                 swapped = (at - start) % 2
                 add_fan(self.corners, (values[at - 2 + swapped], values[at - 1 - swapped], values[at]))
 
-    def surface(self) -> Surface:
+    def content(self) -> PlyContent:
         """Return all vertices and triangles."""
         vertices = np.array(self.positions).reshape(-1, 3) if self.positions else self.vertices
-        return vertices, np.array(self.corners, np.int64).reshape(-1, 3)
+        return PlyContent(vertices, np.array(self.corners, np.int64).reshape(-1, 3), self.normals)
 
 
 def parse_ply(content: bytes) -> Surface:
@@ -56,26 +70,36 @@ def parse_ply(content: bytes) -> Surface:
     Raises:
         ValueError: the file is damaged; the message is a short reason.
     """
+    read = read_ply(content)
+    return read.vertices, read.faces
+
+
+def read_ply(content: bytes) -> PlyContent:
+    """Parse a PLY file as `parse_ply` does, and also the normals nx, ny and nz of `vertex` if it has no lists.
+
+    Raises:
+        ValueError: the file is damaged; the message is a short reason.
+    """
     content = content.removeprefix(b"\xef\xbb\xbf")  # a mark that some editors write before text
     header = read_ply_header(content)
-    found: list[Surface] = []
+    found: list[PlyContent] = []
     problems: list[ValueError] = []
     for start in header.starts:
         try:
-            surface, end = _read_elements(content, header, start)
+            read, end = _read_elements(content, header, start)
         except ValueError as error:
             problems.append(error)
             continue
         if end == len(content):
-            return surface
-        found.append(surface)
+            return read
+        found.append(read)
     if not found:
         raise problems[0]
     return found[0]
 
 
-def _read_elements(content: bytes, header: PlyHeader, position: int) -> tuple[Surface, int]:
-    """Return the surface in the data from `position` on, and where the data of its elements end."""
+def _read_elements(content: bytes, header: PlyHeader, position: int) -> tuple[PlyContent, int]:
+    """Return the content of the data from `position` on, and where the data of its elements end."""
     order, found = header.order, _Found()
     words = content[position:].split() if not order else []
     position = position if order else 0
@@ -88,12 +112,13 @@ def _read_elements(content: bytes, header: PlyHeader, position: int) -> tuple[Su
         wanted = _columns(element)
         if not element.has_lists:
             position, table = _read_table(content, words, order, element, position, wanted)
-            found.vertices = table if element.name == "vertex" else found.vertices
+            if element.name == "vertex":
+                found.vertices, found.normals = table[:, :3], table[:, 3:] if table.shape[1] == 6 else None
         elif order:
             position = _read_binary_lists(content, order, element, position, wanted, found)
         else:
             position = _read_text_lists(words, element, position, wanted, found)
-    return found.surface(), position
+    return found.content(), position
 
 
 def _columns(element: PlyElement) -> list[int]:
@@ -105,7 +130,9 @@ def _columns(element: PlyElement) -> list[int]:
             raise ValueError("its vertices: wanted x, y and z once each")
         if element.has_lists and columns != sorted(columns):
             raise ValueError("its vertices have lists: wanted x before y before z")
-        return columns
+        normals = [names.index(axis) for axis in ("nx", "ny", "nz") if names.count(axis) == 1]
+        has_normals = len(normals) == 3 and not element.has_lists
+        return [*columns, *normals] if has_normals else columns
     if element.name not in ("face", "tristrips"):
         return []
     found = [i for i, p in enumerate(element.properties) if p.name in _INDICES and p.count_code and p.code not in "fd"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from snarfcli.formats.plain_meshes import MAX_FACES, parse_obj, parse_stl
 from snarfcli.formats.ply import parse_ply
 from snarfcli.texts import one_line
 
-__all__ = ["SURFACE_SUFFIXES", "list_surfaces", "read_surface"]
+__all__ = ["SURFACE_SUFFIXES", "checked_surface", "list_files", "list_surfaces", "read_mesh_bytes", "read_surface"]
 
 SURFACE_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 """File suffixes that `read_surface` accepts, in lower case."""
@@ -33,11 +34,16 @@ def list_surfaces(folder: str | Path) -> list[Path]:
     Raises:
         UserError: the folder does not exist or cannot be opened.
     """
+    return list_files(folder, SURFACE_SUFFIXES)
+
+
+def list_files(folder: str | Path, suffixes: Collection[str]) -> list[Path]:
+    """Return the files with some suffixes (lower case) directly inside a folder, sorted and with errors as `list_surfaces`."""
     folder = Path(folder)
     if not folder.is_dir():
         raise UserError(f"no folder with meshes at {folder}")
     try:
-        found = [p for p in folder.iterdir() if p.suffix.lower() in SURFACE_SUFFIXES and not p.name.startswith(".")]
+        found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     except OSError as error:
         raise UserError(f"folder {folder} cannot be opened ({error.strerror or error})") from None
     return sorted((path for path in found if path.is_file()), key=_natural)
@@ -81,13 +87,27 @@ def read_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int6
     if suffix in (".glb", ".gltf"):
         vertices, faces = read_gltf_surface(path)
     else:
-        content = _read_bytes(path)
+        content = read_mesh_bytes(path)
         try:
             with np.errstate(invalid="ignore"):  # NaN is rejected below
                 vertices, faces = _PARSERS[suffix](content)
         except (ValueError, OverflowError, MemoryError) as error:
             raise_system_error(error, path)
             raise UserError(f"mesh {path} cannot be read ({one_line(error, 200)}); copy it again or export it again") from None
+    return checked_surface(path, vertices, faces)
+
+
+def checked_surface(
+    path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the surface of a file that was parsed, as `read_surface` describes it, or raise UserError as it does.
+
+    Args:
+        path: the file.
+        vertices: [V, 3].
+        faces: [F, 3], not yet checked.
+    """
+    suffix = path.suffix.lower()
     if not len(faces):
         raise UserError(f"mesh {path} has no triangles (a point cloud is not a surface); give a mesh with faces")
     if len(faces) > MAX_FACES:
@@ -104,7 +124,12 @@ def read_surface(path: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int6
     return vertices, faces
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_mesh_bytes(path: Path) -> bytes:
+    """Return the bytes of a file of a surface or of points.
+
+    Raises:
+        UserError: it is missing, cannot be opened, is too large, or is a PLY file with too many words of text.
+    """
     try:
         if not path.exists():
             raise UserError(f"no mesh at {path}")

@@ -44,6 +44,7 @@ class FitOptions:
         return {
             "body": self.body.body,
             "gender": self.body.gender,
+            "skeleton": self.body.skeleton,
             "scale": self.scale,
             "up": self.up,
             "clothes_m": self.clothes_m,

@@ -21,7 +21,7 @@ from snarfcli.registration.written import FitMade, FittedFile
 from snarfcli.texts import counted, one_line
 from snarfcli.versions import recorded_code, recorded_versions
 
-__all__ = ["FIGURE", "REPORT", "SequenceReport", "fit_remarks", "write_fit_report"]
+__all__ = ["FIGURE", "REPORT", "SequenceReport", "fit_remarks", "report_remarks", "write_fit_report"]
 
 FIGURE = "fit.png"
 """Name of the figure, in the folder of the subject."""
@@ -132,12 +132,16 @@ def fit_remarks(subject: str, request: Request) -> Iterator[Remark]:
         request: the data set and its folders.
     """
     place = scan_subjects(request).get(subject) if request.config.name == "meshes" else None
-    if place is None or not (place / REPORT).is_file():
-        return
+    if place is not None and (place / REPORT).is_file():
+        yield from report_remarks(place / REPORT)
+
+
+def report_remarks(path: Path) -> list[Remark]:
+    """Return what a report says, and what to do; if it is damaged, that."""
     try:
-        yield from _remarks(read_json(place / REPORT, "report"))
-    except (UserError, KeyError, TypeError, ValueError, AttributeError):
-        yield Remark("fit", f"{place / REPORT} is damaged; run the same snarf fit again", "warning")
+        return list(_remarks(read_json(path, "report")))
+    except (UserError, KeyError, TypeError, ValueError, OverflowError):
+        return [Remark("fit", f"{path} is damaged; run the same snarf fit again", "warning")]
 
 
 def _remarks(content: Any) -> Iterator[Remark]:

@@ -7,13 +7,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from snarfcli.registration.fitter import BodyChoice, load_fitter
+from snarfcli.registration.body_surface import BodyState
+from snarfcli.registration.fitter import BodyChoice, Fitter, load_fitter
+from snarfcli.registration.same_topology import fit_one_topology, is_own_topology
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.scans import ScanSequence
 from snarfcli.registration.starts import Found
@@ -23,6 +26,10 @@ __all__ = ["SequenceTask", "find_single_frames", "fit_sequences", "is_in_order"]
 
 Array = NDArray[np.float64]
 
+_SHORT = 30  # frames; a shorter sequence is fitted faster by its points than by its vertices
+_ANCHORS = 4  # frames that are found before vertices are attached to the body
+_GOOD = 1.3  # times the misfit of the best of them
+_MOST_TRUSTED = 0.5  # share of the frames; with fewer, the vertices are no fixed points of a body
 _PAIRS = 6  # of frames that are compared to see whether a sequence is a motion
 _COMPARED = 300  # points
 _NEAR = 0.6  # distance of neighbouring frames to that of others, below which they are a motion
@@ -39,6 +46,8 @@ class SequenceTask:
     """Its frames, without those that cannot be read."""
     ordered: str
     """Whether neighbouring frames show a motion: auto, true or false."""
+    has_one_topology: bool
+    """Whether all frames are meshes with the same faces."""
 
 
 def find_single_frames(choice: BodyChoice, clothes_m: float, scans: Sequence[ScanPoints]) -> Iterator[Found]:
@@ -65,22 +74,59 @@ def fit_sequences(
     fitter = load_fitter(choice)
     for task in tasks:
         started = time.process_time()
-        is_ordered = task.ordered == "true" or (task.ordered == "auto" and is_in_order(task.scans))
-
-        def fit(on_frame: Callable[[int], None], task: SequenceTask = task, is_ordered: bool = is_ordered) -> FittedSequence:
-            return fit_sequence(
-                fitter.surface,
-                task.scans,
-                fitter.finder,
-                fitter.prior,
-                betas=betas,
-                clothes_m=clothes_m,
-                is_ordered=is_ordered,
-                on_frame=on_frame,
-            )
-
-        for item in _told(fit):
+        for item in _told(partial(_fit_sequence, fitter, betas, clothes_m, task)):
             yield task.number, item if isinstance(item, int) else (item, time.process_time() - started)
+
+
+def _fit_sequence(
+    fitter: Fitter, betas: Array, clothes_m: float, task: SequenceTask, on_frame: Callable[[int], None]
+) -> FittedSequence:
+    """Fit one sequence: by its vertices where all frames have the same, otherwise by points on the surface."""
+    if task.has_one_topology:
+        fitted = _follow_vertices(fitter, betas, clothes_m, task.scans, on_frame)
+        if fitted is not None:
+            return fitted
+    return fit_sequence(
+        fitter.surface,
+        task.scans,
+        fitter.finder,
+        fitter.prior,
+        betas=betas,
+        clothes_m=clothes_m,
+        is_ordered=task.ordered == "true" or (task.ordered == "auto" and is_in_order(task.scans)),
+        on_frame=on_frame,
+    )
+
+
+def _follow_vertices(
+    fitter: Fitter, betas: Array, clothes_m: float, scans: ScanSequence, on_frame: Callable[[int], None]
+) -> FittedSequence | None:
+    """Fit a sequence whose frames have the same faces; None if it is too short, or its vertices do not stay on the body."""
+    faces, anchors = scans.faces(), {}
+
+    def refit(frame: int, near: Sequence[BodyState]) -> Found:
+        return fitter.finder.find(scans[frame], betas=betas, clothes_m=clothes_m, near=near)
+
+    if not is_own_topology(fitter.faces, len(scans.vertices(0)), faces):
+        if len(scans) < _SHORT:
+            return None
+        for frame in np.linspace(0, len(scans) - 1, _ANCHORS).round().astype(int).tolist():
+            anchors[frame] = refit(frame, ())
+        best = min(found.agreement.misfit for found in anchors.values())
+        anchors = {frame: found.state for frame, found in anchors.items() if found.agreement.misfit < _GOOD * best}
+    fitted = fit_one_topology(
+        fitter.whole,
+        fitter.faces,
+        faces,
+        scans.vertices,
+        len(scans),
+        anchors,
+        betas=betas,
+        clothes_m=clothes_m,
+        refit=refit,
+        on_frame=on_frame,
+    )
+    return fitted if fitted.is_trusted.mean() > _MOST_TRUSTED else None
 
 
 def is_in_order(scans: ScanSequence) -> bool:

@@ -10,36 +10,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from snarfcli import point_clouds
+from snarfcli.datasets.mesh_folders import POSE_FILES
 from snarfcli.errors import UserError
-from snarfcli.formats.surfaces import list_surfaces, read_surface
+from snarfcli.formats.surfaces import read_surface
+from snarfcli.point_clouds import estimate_normals
+from snarfcli.point_clouds.files import PointFile, list_frames, read_frame
 from snarfcli.sampling.surface import oriented_surface_samples
 
-__all__ = ["FEWEST_POINTS", "ScanFacts", "examine_files", "fingerprint", "list_scans", "read_scan"]
+__all__ = [
+    "FEWEST_POINTS",
+    "ScanFacts",
+    "examine_files",
+    "fingerprint",
+    "list_scans",
+    "read_scan",
+    "read_vertices",
+    "topology_of",
+]
 
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 500
 """A frame with fewer points says too little about a pose."""
-
-
-def list_scans(folder: Path) -> list[Path]:
-    """Return the scans directly inside a folder, in natural order."""
-    return list_surfaces(folder)
-
-
-def read_scan(path: Path, count: int, seed: int) -> tuple[Array, Array]:
-    """Return points [P, 3] and unit normals [P, 3] of a scan, units and axes of the file.
-
-    Args:
-        path: the file.
-        count: number of points on a mesh, maximum number of a point cloud.
-        seed: of the points that are chosen.
-
-    Raises:
-        UserError: the file cannot be read, or has numbers that are not finite.
-    """
-    vertices, faces = read_surface(path)
-    return oriented_surface_samples(vertices, faces, count, np.random.default_rng([seed, 1]))
+_NO_SCANS = (*POSE_FILES, "skeleton.npz", "split.json")
 
 
 @dataclass(frozen=True)
@@ -52,6 +46,48 @@ class ScanFacts:
     """Digest of the faces of a mesh and its number of vertices; empty for a point cloud."""
 
 
+def list_scans(folder: Path) -> list[Path]:
+    """Return the scans directly inside a folder, in natural order."""
+    return list_frames(folder, leave_out=_NO_SCANS)
+
+
+def read_scan(path: Path, count: int, seed: int, *, check_normals: bool = False) -> tuple[Array, Array, str]:
+    """Return points [P, 3] and unit normals [P, 3] of a scan, units and axes of the file, and what was wrong with its normals.
+
+    Args:
+        path: the file.
+        count: number of points on a mesh, maximum number of a point cloud.
+        seed: of the points that are chosen.
+        check_normals: whether the normals of a point cloud are compared with those of planes through its points; takes as
+            long as fitting a pose. Otherwise they are taken as they are. Missing ones are estimated in any case.
+
+    Raises:
+        UserError: the file cannot be read, or has numbers that are not finite.
+    """
+    frame = read_frame(path)
+    draws = np.random.default_rng([seed, 1])
+    if not isinstance(frame, PointFile):
+        return *oriented_surface_samples(*frame, count, draws), ""
+    chosen = draws.permutation(len(frame.points))[:count]
+    points = frame.points[chosen]
+    if frame.normals is None:
+        return points, estimate_normals(points), ""
+    normals = np.nan_to_num(frame.normals[chosen], posinf=0.0, neginf=0.0)
+    if check_normals:
+        checked = point_clouds.check_normals(points, normals)
+        return points, checked.normals, checked.change
+    return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12), ""
+
+
+def read_vertices(path: Path) -> tuple[Array, NDArray[np.int64]]:
+    """Return the vertices [V, 3] and faces [F, 3] of a mesh, units and axes of the file.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    return read_surface(path)
+
+
 def examine_files(paths: Sequence[Path]) -> Iterator[ScanFacts]:
     """Read files, and yield for each what is known of it."""
     yield from map(_examine, paths)
@@ -59,13 +95,18 @@ def examine_files(paths: Sequence[Path]) -> Iterator[ScanFacts]:
 
 def _examine(path: Path) -> ScanFacts:
     try:
-        vertices, faces = read_surface(path)
+        frame = read_frame(path)
     except UserError as error:
         return ScanFacts(str(error))
-    if not len(faces) and len(vertices) < FEWEST_POINTS:
-        return ScanFacts(f"scan {path}: wanted at least {FEWEST_POINTS} points, got {len(vertices)}")
-    digest = hashlib.sha256(f"{len(vertices)} ".encode() + np.ascontiguousarray(faces, "<i8").tobytes())
-    return ScanFacts(topology=digest.hexdigest()[:16] if len(faces) else "")
+    if not isinstance(frame, PointFile):
+        return ScanFacts(topology=topology_of(len(frame[0]), frame[1]))
+    count = len(frame.points)
+    return ScanFacts("" if count >= FEWEST_POINTS else f"scan {path}: wanted at least {FEWEST_POINTS} points, got {count}")
+
+
+def topology_of(vertices: int, faces: NDArray) -> str:
+    """Return a digest of a number of vertices and faces [F, 3], the same for the same topology."""
+    return hashlib.sha256(f"{vertices} ".encode() + np.ascontiguousarray(faces, "<i8").tobytes()).hexdigest()[:16]
 
 
 def fingerprint(paths: Sequence[Path]) -> str:

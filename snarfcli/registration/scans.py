@@ -19,7 +19,7 @@ from snarfcli.datasets.rigged import read_rigged_files
 from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError, nearest
 from snarfcli.names import folder_names
-from snarfcli.registration.scan_files import list_scans, read_scan
+from snarfcli.registration.scan_files import list_scans, read_scan, read_vertices
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.surroundings import Floor, without_surroundings
 
@@ -61,6 +61,8 @@ class ScanSequence:
     """Whether other things stand apart from the subject."""
     share: float = 1.0
     """Share of the points that is on the subject."""
+    checks_normals: bool = False
+    """Whether the normals of point clouds are wrong in some frames."""
     seed: int = 0
     """Of the points that are chosen."""
 
@@ -75,13 +77,25 @@ class ScanSequence:
         """
         path = self.paths[index]
         count = min(_MOST_POINTS, round(self.count * _SPARE / self.share)) if self.share < 1 else self.count
-        points, normals = read_scan(path, count, self.seed + index)
+        points, normals, _ = read_scan(path, count, self.seed + index, check_normals=self.checks_normals)
         subject = without_surroundings(points, normals, self.floor, has_parts=self.has_parts)
         if len(subject[0]) >= _SOMEBODY:  # else the subject is not in this frame, which its residual will show
             points, normals = subject
         if _is_inside_out(points, normals):
             normals = -normals
         return ScanPoints.sampled(self.world.points(points), normals @ self.world.turn.T, self.count, self.seed + index)
+
+    def vertices(self, index: int) -> Array:
+        """Return the vertices [V, 3] of the mesh of one frame, metres, y up, with all that it shows.
+
+        Raises:
+            UserError: the file cannot be read.
+        """
+        return self.world.points(read_vertices(self.paths[index])[0])
+
+    def faces(self) -> NDArray[np.int64]:
+        """Return the faces [F, 3] of the mesh of the first frame."""
+        return read_vertices(self.paths[0])[1]
 
     def chosen(self, frames: Sequence[int]) -> ScanSequence:
         """Return the sequence with some of its frames."""

@@ -19,13 +19,14 @@ from snarfcli.registration.fit_figure import write_fit_figure
 from snarfcli.registration.fit_options import FitOptions
 from snarfcli.registration.fit_report import FIGURE, REPORT, SequenceReport, write_fit_report
 from snarfcli.registration.fit_workers import SequenceTask, fit_sequences
-from snarfcli.registration.fitter import Fitter, load_fitter
+from snarfcli.registration.fitter import Fitter, RigFitter, load_fitter
 from snarfcli.registration.scan_files import ScanFacts, fingerprint
 from snarfcli.registration.scans import ScanFolder, find_scans
 from snarfcli.registration.subject_scans import SubjectScans, read_subject
-from snarfcli.registration.subject_shape import decide_shape
+from snarfcli.registration.subject_shape import decide_shape, resized, rig_size
 from snarfcli.registration.tracker import FittedSequence
 from snarfcli.registration.written import (
+    LONGEST_REASON,
     FitMade,
     FittedFile,
     foreign_files,
@@ -42,7 +43,6 @@ __all__ = ["fit_subject"]
 log = logging.getLogger(__name__)
 
 _FRAMES_PER_TASK = 60  # of short sequences that share a process, which takes some seconds to start
-_LONGEST_REASON = 200
 
 
 def fit_subject(subject: str, request: Request, options: FitOptions) -> bool:
@@ -79,19 +79,23 @@ def fit_subject(subject: str, request: Request, options: FitOptions) -> bool:
 
 def _fit(subject: str, place: Path, folders: Sequence[ScanFolder], options: FitOptions) -> bool:
     """Do all the work, while the lock of the folder is held."""
-    _check_others(place, folders, options.overwrite)
+    _check_others(place, folders, options)
     settings = options.recorded()
     made = None if options.overwrite else read_made(place)
+    fitter = load_fitter(options.body)
     if made is not None:
         _require_same(place, made, settings)
-    fitter = load_fitter(options.body)
+        made = made if len(made.betas) == fitter.surface.num_betas else None  # a damaged file
     frames = counted(sum(len(folder.paths) for folder in folders), "frame")
     log.info("subject %s: %s, %s; %s", subject, counted(len(folders), "sequence"), frames, fitter.source)
     if not fitter.surface.num_betas:
         log.warning("warning: the body has no shape parameters, so it keeps its own shape")
-    scans = read_subject(subject, folders, options, fitter.length_m, None if made is None else made.world)
+    scans = read_subject(subject, folders, options, fitter, None if made is None else made.world)
     for line in scans.survey.facts:
         log.info("%s", line)
+    if isinstance(fitter, RigFitter):
+        scans = resized(scans, rig_size(scans, fitter) if made is None else made.size)
+        fitter = load_fitter(scans.options.body)
     if made is None:
         made = decide_shape(subject, scans, fitter, settings)
         write_skeleton(place, fitter.skeleton(made.betas), made)
@@ -103,10 +107,12 @@ def _fit(subject: str, place: Path, folders: Sequence[ScanFolder], options: FitO
     return len(reports) == len(folders)
 
 
-def _check_others(place: Path, folders: Sequence[ScanFolder], overwrite: bool) -> None:
+def _check_others(place: Path, folders: Sequence[ScanFolder], options: FitOptions) -> None:
     """Raise UserError if files of others are in the way."""
     others = foreign_files(place, [folder.folder for folder in folders])
-    if others and not overwrite:
+    if options.body.skeleton is not None and Path(options.body.skeleton).absolute() in [path.absolute() for path in others]:
+        raise UserError(f"skeleton={options.body.skeleton} would be replaced by the fitted one; keep it outside of {place}")
+    if others and not options.overwrite:
         more = f" and {counted(len(others) - 1, 'more file')}" if others[1:] else ""
         raise UserError(f"{others[0]}{more} were not written by snarf fit; move them, or give overwrite=true to replace them")
 
@@ -133,7 +139,7 @@ def _fit_missing(
         if not scans.usable(number):
             log.warning("left out: sequence %s, of which no frame can be read", folder.name)
             continue
-        there = read_fitted(folder.folder, made)
+        there = read_fitted(folder.folder, made, len(names))
         if there is not None and there.source == fingerprint(folder.paths):
             done[number] = SequenceReport(folder.name, number, there, names)
         else:
@@ -167,7 +173,9 @@ def _fits(
     groups: list[list[SequenceTask]] = []
     room = 0
     for number in numbers:
-        task = SequenceTask(number, scans.sequence(number, made.world), options.ordered)
+        task = SequenceTask(
+            number, scans.sequence(number, made.world), options.ordered, has_one_topology=bool(scans.topology(number))
+        )
         if room <= 0 or len(groups) < options.workers:
             groups.append([])
             room = _FRAMES_PER_TASK
@@ -201,7 +209,7 @@ def _whole(
     """Return the poses of all frames of a sequence; those that cannot be read have the pose of the nearest one."""
     nearest = np.abs(np.arange(len(facts))[:, None] - np.array(usable)).argmin(1)
     is_read = np.isin(np.arange(len(facts)), usable)
-    reasons = [one_line(one.problem or fitted.reasons[nearest[frame]], _LONGEST_REASON) for frame, one in enumerate(facts)]
+    reasons = [one_line(one.problem or fitted.reasons[nearest[frame]], LONGEST_REASON) for frame, one in enumerate(facts)]
     return FittedFile(
         fitted.poses[nearest],
         fitted.translation[nearest],

@@ -13,6 +13,7 @@ from snarfcli.errors import UserError
 from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
 from snarfcli.registration.fit_options import FitOptions
+from snarfcli.registration.fitter import Fitter, RigFitter
 from snarfcli.registration.scan_files import ScanFacts, examine_files, read_scan
 from snarfcli.registration.scans import ScanFolder, ScanSequence
 from snarfcli.registration.survey import Sample, Survey, survey_samples
@@ -49,6 +50,21 @@ class SubjectScans:
         """Return the numbers of the frames of a sequence that can be read."""
         return [frame for frame, facts in enumerate(self.facts[number]) if not facts.problem]
 
+    def topology(self, number: int) -> str:
+        """Return the digest of the faces that all frames of a sequence share, empty if they share none."""
+        found = {facts.topology for facts in self.facts[number] if not facts.problem}
+        return found.pop() if len(found) == 1 else ""
+
+    def shared_topology(self) -> str:
+        """Return the digest of the faces that all frames of all sequences share, empty if they share none."""
+        found = {self.topology(number) for number in range(len(self.folders)) if self.usable(number)}
+        return found.pop() if len(found) == 1 else ""
+
+    def spread_frames(self, count: int) -> list[tuple[int, int]]:
+        """Return at most `count` frames spread over all sequences: sequence, and place among its usable frames."""
+        frames = [(number, index) for number in range(len(self.folders)) for index in range(len(self.usable(number)))]
+        return [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+
     def sequence(self, number: int, world: FileToWorld) -> ScanSequence:
         """Return the frames of a sequence that can be read, as points in metres."""
         whole = ScanSequence(
@@ -58,13 +74,14 @@ class SubjectScans:
             self.survey.floors.get(number),
             number in self.survey.has_parts,
             self.survey.shares[number],
+            number in self.survey.wrong_normals,
             self.options.seed,
         )
         return whole.chosen(self.usable(number))
 
 
 def read_subject(
-    subject: str, folders: Sequence[ScanFolder], options: FitOptions, body_m: float, known: FileToWorld | None
+    subject: str, folders: Sequence[ScanFolder], options: FitOptions, fitter: Fitter, known: FileToWorld | None
 ) -> SubjectScans:
     """Read every file once, and look at some frames of each sequence.
 
@@ -72,7 +89,7 @@ def read_subject(
         subject: name of the subject, for messages.
         folders: its sequences.
         options: settings.
-        body_m: longest side of the body at rest, metres.
+        fitter: the body.
         known: unit and axes that an earlier fit has found.
 
     Raises:
@@ -84,7 +101,9 @@ def read_subject(
         raise UserError(f"subject {subject}: no scan can be used; {facts[0][0].problem}")
     samples = _samples(folders, facts, options)
     scale, up = (options.scale, options.up) if known is None else (repr(known.scale), known.up)
-    survey = survey_samples(samples, [folder.name for folder in folders], body_m, scale, up)
+    body_m = None if isinstance(fitter, RigFitter) else fitter.length_m
+    names = [folder.name for folder in folders]
+    survey = survey_samples(samples, names, body_m, scale, up, is_upright=fitter.is_upright)
     return SubjectScans(tuple(folders), tuple(facts), survey, options)
 
 
@@ -123,6 +142,6 @@ def _samples(folders: Sequence[ScanFolder], facts: Sequence[Sequence[ScanFacts]]
         usable = [frame for frame, one in enumerate(facts[number]) if not one.problem]
         some = np.unique(np.linspace(0, len(usable) - 1, each).round().astype(int)) if usable else []
         for frame in (usable[index] for index in some):
-            points, normals = read_scan(folder.paths[frame], options.points_per_frame, options.seed + frame)
-            samples.append(Sample(number, frame, points, normals))
+            scan = read_scan(folder.paths[frame], options.points_per_frame, options.seed + frame, check_normals=True)
+            samples.append(Sample(number, frame, *scan))
     return samples

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.errors import UserError
+from snarfcli.motions.up_axis import up_axis
 from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
 from snarfcli.registration.body_surface import BodySurface
 from snarfcli.registration.fit_workers import find_single_frames
-from snarfcli.registration.fitter import Fitter
+from snarfcli.registration.fitter import Fitter, RigFitter
+from snarfcli.registration.same_topology import prepare_follower
+from snarfcli.registration.scan_files import topology_of
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import fit_shape
 from snarfcli.registration.starts import Found
@@ -25,7 +29,7 @@ from snarfcli.registration.surroundings import AXES
 from snarfcli.registration.written import FitMade
 from snarfcli.texts import counted
 
-__all__ = ["decide_shape"]
+__all__ = ["decide_shape", "resized", "rig_size"]
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +37,8 @@ Array = NDArray[np.float64]
 
 _FRAMES = 12  # that the shape is made from
 _FRAMES_OF_UP = 4
-_MOST_OBJECTIVE = 0.6  # of a person; 500 points on a person have 0.4, boxes, chairs and balls 0.9 to 1.3
-_GOOD = 1.2  # times the objective of the best frame: such frames tell the shape
+_MOST_MISFIT = 0.3  # of a person: 500 to 4,000 points have 0.03 to 0.08, boxes, chairs and balls 0.5 to 1.1
+_GOOD = 1.3  # times the misfit of the best frame: such frames tell the shape
 _OTHERS = 2  # parts beside the subject that are tried as another person
 _SHAPES_APART_M = 0.03  # mean distance between the bodies of two sequences
 
@@ -44,6 +48,7 @@ class _Seen:
     """One frame with the body found in it."""
 
     sequence: int
+    index: int  # among the usable frames
     scan: ScanPoints
     found: Found
 
@@ -60,26 +65,61 @@ def decide_shape(subject: str, scans: SubjectScans, fitter: Fitter, settings: di
     Raises:
         UserError: the scans show no person, or several.
     """
+    if scans.shared_topology() == topology_of(len(fitter.whole.points_rest), fitter.faces):
+        return _by_own_vertices(scans, fitter, settings)
     world = FileToWorld(scans.survey.scale, scans.survey.up or _up_by_fits(scans, fitter))
     seen = _find(scans, world, _FRAMES)
-    best = min(one.found.agreement.objective for one in seen)
-    if best > _MOST_OBJECTIVE:
+    best = min(one.found.agreement.misfit for one in seen)
+    if best > _MOST_MISFIT:
         residual = min(one.found.agreement.residual_m for one in seen)
+        what = "person" if scans.options.body.skeleton is None else "such body"
         raise UserError(
-            f"no person in the scans of {subject}: in the best of {counted(len(seen), 'frame')} the body is "
+            f"no {what} in the scans of {subject}: in the best of {counted(len(seen), 'frame')} the body is "
             f"{1000 * residual:.0f} mm from the points on average, wanted about 15; check data.scale (now {world.scale:g}) and "
-            f"data.up (now {world.up}), or name another body"
+            f"data.up (now {world.up}), or give another body or skeleton"
         )
     _check_others(subject, scans, world)
     _compare_sequences(scans, fitter.surface, seen)
-    good = [one for one in seen if one.found.agreement.objective <= _GOOD * best]
-    betas = np.zeros(0)
-    if fitter.surface.num_betas:
-        shape = fit_shape(
-            fitter.surface, [(one.scan, one.found.state) for one in good], fitter.prior, clothes_m=scans.options.clothes_m
-        )
-        betas = shape.betas
-    return FitMade(betas, world, settings)
+    good = [one for one in seen if one.found.agreement.misfit <= _GOOD * best]
+    return FitMade(_shape(scans, fitter, world, good), world, settings, scans.options.body.size)
+
+
+def rig_size(scans: SubjectScans, fitter: RigFitter) -> float:
+    """Return the factor that makes a rig about as large as what the scans show."""
+    world = FileToWorld(scans.survey.scale, scans.survey.up or "y")
+    points = [scans.sequence(number, world)[index] for number, index in scans.spread_frames(_FRAMES)]
+    return fitter.rig.sized_to(points).length_m / fitter.rig.length_m
+
+
+def resized(scans: SubjectScans, size: float) -> SubjectScans:
+    """Return scans to which a rig is fitted that is made larger by a factor."""
+    return replace(scans, options=replace(scans.options, body=replace(scans.options.body, size=size)))
+
+
+def _shape(scans: SubjectScans, fitter: Fitter, world: FileToWorld, good: Sequence[_Seen]) -> Array:
+    """Return one shape [S] for all frames, from those in which the body was found."""
+    if not fitter.surface.num_betas:
+        return np.zeros(0)
+    clothes_m = scans.options.clothes_m
+    shape = fit_shape(fitter.surface, [(one.scan, one.found.state) for one in good], fitter.prior, clothes_m=clothes_m)
+    if not scans.shared_topology():
+        return shape.betas
+    vertices = [scans.sequence(one.sequence, world).vertices(one.index) for one in good]
+    faces = scans.sequence(good[0].sequence, world).faces()
+    return prepare_follower(fitter.whole, fitter.faces, faces, vertices, shape.states, clothes_m=clothes_m).betas
+
+
+def _by_own_vertices(scans: SubjectScans, fitter: Fitter, settings: dict[str, Any]) -> FitMade:
+    """Return the shape and the up axis from scans with the vertices of the body itself, in which nothing has to be found."""
+    world = FileToWorld(scans.survey.scale, scans.survey.up or "y")
+    vertices = [scans.sequence(number, world).vertices(index) for number, index in scans.spread_frames(_FRAMES)]
+    clothes_m = scans.options.clothes_m
+    follower = prepare_follower(fitter.whole, fitter.faces, fitter.faces, vertices, [], clothes_m=clothes_m)
+    if scans.survey.up is None:
+        poses = follower.follow(vertices.__getitem__, len(vertices)).poses
+        world = replace(world, up=up_axis(Rotation.from_rotvec(poses[:, 0])))
+        log.info("up axis %s: the body stands along it (data.up=y or z sets it)", world.up)
+    return FitMade(follower.betas, world, settings, scans.options.body.size)
 
 
 def _up_by_fits(scans: SubjectScans, fitter: Fitter) -> str:
@@ -87,7 +127,7 @@ def _up_by_fits(scans: SubjectScans, fitter: Fitter) -> str:
     cost = {}
     for up in AXES:
         seen = _find(scans, FileToWorld(scans.survey.scale, up), _FRAMES_OF_UP)
-        cost[up] = float(np.mean([one.found.agreement.objective for one in seen]))
+        cost[up] = float(np.mean([one.found.agreement.misfit for one in seen]))
     chosen = min(cost, key=lambda up: cost[up])
     log.info("up axis %s: the body fits better than with the other one (data.up=y or z sets it)", chosen)
     return chosen
@@ -95,11 +135,10 @@ def _up_by_fits(scans: SubjectScans, fitter: Fitter) -> str:
 
 def _find(scans: SubjectScans, world: FileToWorld, count: int) -> list[_Seen]:
     """Return frames spread over all sequences, with the body found in each."""
-    frames = [(number, index) for number in range(len(scans.folders)) for index in range(len(scans.usable(number)))]
-    chosen = [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+    chosen = scans.spread_frames(count)
     points = [scans.sequence(number, world)[index] for number, index in chosen]
     found = _found_in(scans, points)
-    return [_Seen(number, scan, one) for (number, _), scan, one in zip(chosen, points, found, strict=True)]
+    return [_Seen(*place, scan, one) for place, scan, one in zip(chosen, points, found, strict=True)]
 
 
 def _found_in(scans: SubjectScans, points: Sequence[ScanPoints]) -> list[Found]:
@@ -124,7 +163,7 @@ def _check_others(subject: str, scans: SubjectScans, world: FileToWorld) -> None
         for points, normals in scans.survey.others[:_OTHERS]
     ]
     for found in _found_in(scans, parts) if parts else []:
-        if found.agreement.objective <= _MOST_OBJECTIVE:
+        if found.agreement.misfit <= _MOST_MISFIT:
             raise UserError(f"the scans of {subject} show several persons; keep one of them in each scan")
 
 

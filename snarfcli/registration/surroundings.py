@@ -155,8 +155,8 @@ def find_parts(points: Array) -> list[Part]:
     labels = connected_components(graph, directed=False)[1]
     sizes = np.bincount(labels)
     order = [label for label in np.argsort(-sizes, kind="stable") if sizes[label] >= _SMALLEST_PART * len(points)]
-    if len(order) == 1:
-        return [_part(points, labels == order[0])]
+    if len(order) < 2:  # also if all points are far apart
+        return [_part(points, labels == order[0] if order else np.ones(len(points), bool))]
     main = labels == order[0]
     apart: list[Part] = []
     nearest = KDTree(points[main])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.checks import alternatives
+from snarfcli.datasets.recorded_sequence import person_scale
 from snarfcli.errors import UserError
 from snarfcli.registration.surroundings import AXES, Floor, Part, find_floor, find_parts, robust_box, without_surroundings
 
@@ -23,6 +24,7 @@ _LENGTHS = (0.35, 1.55)  # of what is seen, as a share of the longest side of th
 _CLEAR = 1.3  # ratio of two sides, above which the longer one is the height
 _MOST_FLOORS = 0.5  # share of the samples that show a floor, if the sequence has one
 _LIKE_THE_SUBJECT = (0.5, 1.8)  # lengths of another part, as shares of that of the subject, that can be another person
+_LISTED = 4  # names on one line
 _SHARE_OF_A_PERSON = 0.35  # of the number of points of the subject
 
 
@@ -38,6 +40,8 @@ class Sample:
     """[P, 3]."""
     normals: Array
     """[P, 3], unit length."""
+    change: str = ""
+    """What was wrong with the normals of the file; empty if nothing was."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class Survey:
     """Floors by number of the sequence, units and axes of the files."""
     has_parts: frozenset[int]
     """Numbers of the sequences in which other things stand apart."""
+    wrong_normals: frozenset[int]
+    """Numbers of the sequences whose files have normals that are wrong in some frames."""
     shares: Mapping[int, float]
     """Smallest share of the points that is on the subject, by number of the sequence."""
     others: tuple[tuple[Array, Array], ...]
@@ -60,15 +66,18 @@ class Survey:
     """Lines about all this."""
 
 
-def survey_samples(samples: Sequence[Sample], names: Sequence[str], body_m: float, scale: str, up: str) -> Survey:
+def survey_samples(
+    samples: Sequence[Sample], names: Sequence[str], body_m: float | None, scale: str, up: str, *, is_upright: bool = True
+) -> Survey:
     """Look at some frames of each sequence.
 
     Args:
         samples: frames, at least one of each sequence.
         names: of the sequences.
-        body_m: longest side of the body at rest, metres.
+        body_m: longest side of the body at rest, metres; None if the body has no size of its own.
         scale: the setting data.scale: auto, or metres per unit.
         up: the setting data.up: auto, y or z.
+        is_upright: whether the body is usually highest when it stands.
 
     Raises:
         UserError: the unit cannot be guessed.
@@ -88,28 +97,40 @@ def survey_samples(samples: Sequence[Sample], names: Sequence[str], body_m: floa
     metres, why = _scale(float(np.quantile(sides.max(1), 0.8)), body_m, scale)
     facts = [why]
     if chosen_up is None:
-        chosen_up, why = _up(sides)
+        chosen_up, why = _up(sides) if is_upright else (None, "")
         facts += [why] if why else []
     elif up == "auto":
         facts.append(f"up axis {chosen_up}: the scans show a floor (data.up=y or z sets it)")
     if floors:
         facts.append(f"left out: a floor, {_listed(names[number] for number in floors)}")
+    apart = {sample.sequence: found for sample, found in zip(samples, parts, strict=True) if len(found) > 1}
+    if apart:
+        longest = max(part.length for found in apart.values() for part in found[1:])
+        where = _listed(names[number] for number in apart)
+        facts.append(f"left out: things apart from the subject, up to {metres * longest:.2f} m long, {where}")
+    if floors or apart:
+        facts.append(
+            "they stay in the files: cut them off before snarf preprocess, or they are learned as a part of the subject"
+        )
+    wrong = {sample.sequence: sample.change for sample in samples if sample.change}
+    facts += [f"normals of {names[number]} {change}" for number, change in list(wrong.items())[:_LISTED]]
     others = [
         (points[part.is_in], normals[part.is_in])
         for (points, normals), found in zip(above, parts, strict=True)
         for part in found[1:]
         if _is_like(part, found[0])
     ]
+    shares = _shares(samples, parts)
+    return Survey(metres, chosen_up, floors, frozenset(apart), frozenset(wrong), shares, tuple(others), tuple(facts))
+
+
+def _shares(samples: Sequence[Sample], parts: Sequence[Sequence[Part]]) -> dict[int, float]:
+    """Return the smallest share of the points that is on the subject, by number of the sequence."""
     shares: dict[int, float] = {}
     for sample, found in zip(samples, parts, strict=True):
         share = found[0].is_in.sum() / len(sample.points) if found else 1.0
         shares[sample.sequence] = min(share, shares.get(sample.sequence, 1.0))
-    apart = {sample.sequence: found for sample, found in zip(samples, parts, strict=True) if len(found) > 1}
-    if apart:
-        longest = max(part.length for found in apart.values() for part in found[1:])
-        where = _listed(names[number] for number in apart)
-        facts.append(f"left out: things apart from the subject, up to {metres * longest:.2f} m long, {where}")
-    return Survey(metres, chosen_up, floors, frozenset(apart), shares, tuple(others), tuple(facts))
+    return shares
 
 
 def _floors(samples: Sequence[Sample], seen: Sequence[Floor | None]) -> dict[int, Floor]:
@@ -123,10 +144,12 @@ def _floors(samples: Sequence[Sample], seen: Sequence[Floor | None]) -> dict[int
     return floors
 
 
-def _scale(length: float, body_m: float, wanted: str) -> tuple[float, str]:
+def _scale(length: float, body_m: float | None, wanted: str) -> tuple[float, str]:
     """Return the metres per unit, and the reason as text; `length` is that of the subject, units of the files."""
     if wanted != "auto":
         return float(wanted), f"scaled by {float(wanted):g} (data.scale): {float(wanted) * length:.2f} m long"
+    if body_m is None:
+        return person_scale(length, length, wanted, None)
     low, high = (share * body_m for share in _LENGTHS)
     for name, metres in UNITS.items():
         if low <= metres * length <= high:
@@ -161,4 +184,4 @@ def _is_like(part: Part, subject: Part) -> bool:
 def _listed(names) -> str:
     """Return names as the end of a line."""
     names = list(names)
-    return f"in {', '.join(names[:4])}" + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return f"in {', '.join(names[:_LISTED])}" + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")

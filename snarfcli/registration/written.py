@@ -22,8 +22,11 @@ from snarfcli.datasets.mesh_folders import POSE_FILES, skeleton_files
 from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.errors import UserError
 from snarfcli.files import write_arrays
+from snarfcli.registration.surroundings import AXES
+from snarfcli.texts import one_line
 
 __all__ = [
+    "LONGEST_REASON",
     "MADE_BY",
     "FitMade",
     "FittedFile",
@@ -39,6 +42,10 @@ Array = NDArray[np.float64]
 
 MADE_BY = "snarf fit"
 """Entry of the files."""
+LONGEST_REASON = 200
+"""Letters of a reason why a frame is not trusted."""
+_MAX_BYTES = 2**29
+_LARGEST = 1e9  # number in a file that is not damaged
 _SKELETON, _POSES = "skeleton.npz", "poses.npz"
 
 
@@ -52,11 +59,13 @@ class FitMade:
     """Unit and axes of the files."""
     settings: Mapping[str, Any]
     """Settings that the poses depend on."""
+    size: float = 1.0
+    """Factor by which a rig is made larger, see `BodyChoice`."""
 
     @property
     def digest(self) -> str:
         """Tells poses of this fit from those of another one."""
-        content = [*np.asarray(self.betas).tolist(), self.world.scale, self.world.up, self.settings]
+        content = [*np.asarray(self.betas).tolist(), self.world.scale, self.world.up, self.settings, self.size]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -98,6 +107,7 @@ def write_skeleton(place: Path, skeleton: Skeleton, made: FitMade) -> None:
         "up": np.array(world.up),
         "scale": np.array(world.scale),
         "betas": np.asarray(made.betas, np.float64),
+        "size": np.array(made.size),
         "settings": np.array(json.dumps(made.settings, sort_keys=True)),
         "made_by": np.array(MADE_BY),
     }
@@ -110,11 +120,15 @@ def read_made(place: Path) -> FitMade | None:
     if not path.is_file() or not _is_own(path):
         return None
     try:
-        arrays = read_npz(path, "skeleton file")
+        arrays = read_npz(path, "skeleton file", max_bytes=_MAX_BYTES)
         world = FileToWorld(float(arrays["scale"]), str(arrays["up"]))
-        return FitMade(np.asarray(arrays["betas"], np.float64), world, json.loads(str(arrays["settings"])))
-    except (UserError, KeyError, ValueError, TypeError):
+        settings, betas = json.loads(str(arrays["settings"])), np.asarray(arrays["betas"], np.float64)
+        made = FitMade(betas, world, settings, float(arrays["size"]))
+    except (UserError, KeyError, ValueError, TypeError, OverflowError, RecursionError):
         return None
+    numbers = np.array([*betas.reshape(-1), world.scale, made.size])
+    is_whole = betas.ndim == 1 and np.isfinite(numbers).all() and min(world.scale, made.size) > 0 and world.up in AXES
+    return made if is_whole and isinstance(settings, dict) else None
 
 
 def write_fitted(folder: Path, fitted: FittedFile, made: FitMade, frame_rate: float) -> None:
@@ -135,13 +149,13 @@ def write_fitted(folder: Path, fitted: FittedFile, made: FitMade, frame_rate: fl
     write_arrays(folder / _POSES, arrays)
 
 
-def read_fitted(folder: Path, made: FitMade) -> FittedFile | None:
-    """Return the poses that this fit has written for a sequence; None if there are none, or they are damaged."""
+def read_fitted(folder: Path, made: FitMade, joints: int) -> FittedFile | None:
+    """Return the poses of a number of joints that this fit has written for a sequence; None without any, or if damaged."""
     path = folder / _POSES
     if not path.is_file() or not _is_own(path):
         return None
     try:
-        arrays = read_npz(path, "pose file")
+        arrays = read_npz(path, "pose file", max_bytes=_MAX_BYTES)
         if str(arrays["fit"]) != made.digest:
             return None
         fitted = FittedFile(
@@ -149,15 +163,17 @@ def read_fitted(folder: Path, made: FitMade) -> FittedFile | None:
             made.world.points(arrays["trans"]),
             np.asarray(arrays["residual_m"], np.float64),
             np.asarray(arrays["trusted"], bool),
-            tuple(str(reason) for reason in arrays["reasons"]),
+            tuple(one_line(str(reason), LONGEST_REASON) for reason in arrays["reasons"]),
             str(arrays["source"]),
             float(arrays["seconds"]),
         )
-    except (UserError, KeyError, ValueError, TypeError):
+    except (UserError, KeyError, ValueError, TypeError, OverflowError):
         return None
-    frames = len(fitted.poses)
-    lengths = {len(fitted.translation), len(fitted.residual_m), len(fitted.is_trusted), len(fitted.reasons)}
-    return fitted if lengths == {frames} else None
+    frames = len(fitted.reasons)
+    shapes = [fitted.poses.shape, fitted.translation.shape, fitted.residual_m.shape, fitted.is_trusted.shape]
+    is_whole = np.isfinite(fitted.residual_m).any() and shapes == [(frames, joints, 3), (frames, 3), (frames,), (frames,)]
+    numbers = [fitted.poses, fitted.translation, np.nan_to_num(fitted.residual_m, nan=0.0, posinf=np.inf), fitted.seconds]
+    return fitted if is_whole and all((np.abs(array) < _LARGEST).all() for array in numbers) else None
 
 
 def remove_replaced(place: Path, folders: Sequence[Path]) -> None:

@@ -21,9 +21,7 @@ def frame_numbers(spec: SequenceSpec, frame_steps: Mapping[str, int]) -> np.ndar
         spec: the sequence.
         frame_steps: per split, the step between sampled frames; ignored if the data set has chosen the frames.
     """
-    if spec.frames is not None:
-        return np.asarray(spec.frames, np.int64)
-    return np.arange(0, spec.motion.num_frames, frame_steps[spec.split])
+    return spec.every(frame_steps[spec.split])
 
 
 def frame_arrays(skeleton: Skeleton, spec: SequenceSpec, frames: np.ndarray) -> dict[str, np.ndarray]:

@@ -11,14 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from toy_animal import animal_motion, make_animal
+from toy_animal_files import animal_glb, write_animal_meshes
 from toy_scans import BETAS, QuickFinder, joint_error_mm, toy_mesh, toy_poses, write_scans
 
 from snarfcli.commands import fit
 from snarfcli.commands.fit import FitConfig
+from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError
 from snarfcli.output_locks import hold_output
 from snarfcli.registration import fit_figure, fitter, subject_fit, subject_scans, subject_shape
+from snarfcli.sampling import oriented_surface_samples
 
 ACCURATE_MM = 10.0  # measured 3 to 6, with 300 vertices and 1,000 points
 
@@ -47,7 +52,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 def _config(root: Path, **changes: Any) -> FitConfig:
     data = {name: changes.pop(name) for name in ("scale", "up", "folder") if name in changes}
     return FitConfig(**{
-        "subject": "me", "data": DataConfig("meshes", 1, 1, 1, **data), "data_root": str(root), "body": None,
+        "subject": "me", "data": DataConfig("meshes", 1, 1, 1, **data), "data_root": str(root), "body": None, "skeleton": None,
         "gender": "neutral", "clothes": "false", "points_per_frame": 1000, "ordered": "auto", "frame_rate": 30.0,
         "workers": 1, "seed": 0, "overwrite": False, "skip_broken": False, **changes,
     })  # fmt: skip
@@ -74,8 +79,7 @@ def test_sequences_are_fitted_written_and_reported(
     caplog.set_level(logging.INFO)
     assert fit.run(_config(tmp_path)) == 0
     assert _files(me) == {"skeleton.npz", "fit.json", "fit.png", "run/poses.npz", "walk/poses.npz"}
-    errors = joint_error_mm(tmp_path, {"run": toy_poses(2, 1.0), "walk": toy_poses(3)})
-    assert set(errors) == {"run", "walk"}
+    errors = joint_error_mm(me, {"run": toy_poses(2, 1.0), "walk": toy_poses(3)})
     assert max(errors.values()) < ACCURATE_MM
     report = json.loads((me / "fit.json").read_text())
     assert report["complete"] is True
@@ -95,8 +99,55 @@ def test_sequences_are_fitted_written_and_reported(
     assert {name: (me / name).read_bytes() for name in before} == before
     with pytest.raises(UserError, match=r"fitted with other settings \(seed 0 -> 5\).*overwrite=true"):
         fit.run(_config(tmp_path, seed=5))
-    fit.run(_config(tmp_path, seed=5, overwrite=True))
-    assert (me / "skeleton.npz").read_bytes() != before["skeleton.npz"]
+    data = find_dataset("meshes").load("me", Request(DataConfig("meshes", 1, 1, 1), tmp_path))
+    assert {spec.name for spec in data.sequences} == {"run", "walk"}
+    assert not data.broken
+
+
+def test_meshes_with_the_vertices_of_the_body_are_fitted_exactly(tmp_path: Path, quick: pytest.MonkeyPatch) -> None:
+    place = tmp_path / "meshes" / "me"
+    truth = {
+        "run": write_scans(place / "run", 2, phase=1.0, unit_m=0.01, up="z", one_topology=True),
+        "walk": write_scans(place / "walk", 3, unit_m=0.01, up="z", one_topology=True),
+    }
+    fit.run(_config(tmp_path))
+    errors = joint_error_mm(place, truth)
+    assert max(errors.values()) < 0.5  # measured 0.03
+
+
+def test_points_without_normals_are_fitted(tmp_path: Path, quick: pytest.MonkeyPatch) -> None:
+    place = tmp_path / "meshes" / "me" / "walk"
+    place.mkdir(parents=True)
+    poses, places = toy_poses(2)
+    for frame in range(2):
+        vertices, faces = toy_mesh(poses[frame], places[frame])
+        points, _ = oriented_surface_samples(vertices, faces, 1200, np.random.default_rng(frame))
+        np.savetxt(place / f"{frame}.xyz", 100 * points)
+    fit.run(_config(tmp_path))
+    assert joint_error_mm(place.parent, {"walk": (poses, places)})["walk"] < ACCURATE_MM
+    fit.run(_config(tmp_path))  # its own poses.npz is no scan
+
+
+def test_a_rig_is_fitted_in_place_of_a_body(
+    tmp_path: Path, quick: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    animal, motion = make_animal(0.06), animal_motion("trot", 3)
+    (tmp_path / "animal.glb").write_bytes(animal_glb(animal, [motion]))
+    write_animal_meshes(tmp_path / "meshes" / "me", animal, [motion])
+    config = _config(tmp_path, skeleton=str(tmp_path / "animal.glb"), frame_rate=24.0)
+    for path in (tmp_path / "meshes" / "me").rglob("*.*"):
+        if path.suffix != ".obj":
+            path.unlink()
+    fit.run(config)
+    data = find_dataset("meshes").load("me", Request(config.data, tmp_path))
+    assert data.skeleton.names == animal.names
+    assert "rig" in caplog.text
+    moved = data.sequences[0].motion.poses
+    assert moved.shape[1:] == (len(animal.names), 3)
+    arrays = np.load(tmp_path / "meshes" / "me" / "trot" / "poses.npz")
+    assert arrays["residual_m"].max() < 0.002
+    assert arrays["trusted"].all()
 
 
 def test_units_axes_and_a_floor_are_found_once_for_all(
@@ -113,7 +164,7 @@ def test_units_axes_and_a_floor_are_found_once_for_all(
     fit.run(_config(tmp_path, points_per_frame=1500))
     for line in ("the files are in mm", "up axis z: the scans show a floor", "left out: a floor, in walk"):
         assert line in caplog.text
-    assert joint_error_mm(tmp_path, truth)["walk"] < 15  # without soles
+    assert joint_error_mm(place, truth)["walk"] < 15  # without soles
 
 
 def test_an_interrupted_fit_goes_on(
@@ -160,6 +211,19 @@ def test_files_of_others_are_kept(tmp_path: Path, me: Path, quick: pytest.Monkey
     assert _files(me) == {"skeleton.json", "walk/motion.bvh"}
     fit.run(_config(tmp_path, overwrite=True))
     assert _files(me) == {"skeleton.npz", "fit.json", "fit.png", "run/poses.npz", "walk/poses.npz"}
+
+
+def test_all_leaves_out_subjects_with_poses_of_others(
+    tmp_path: Path, me: Path, quick: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (me / "skeleton.json").write_text("{}")
+    with pytest.raises(UserError, match="no scans in"):
+        fit.run(_config(tmp_path, subject="all"))
+    assert "left out: subject me, which has a skeleton or poses that snarf fit has not written" in caplog.text
+    write_scans(tmp_path / "meshes" / "you" / "walk", 2, one_topology=True)
+    fit.run(_config(tmp_path, subject="all"))
+    assert _files(me) == {"skeleton.json"}
+    assert "walk/poses.npz" in _files(tmp_path / "meshes" / "you")
 
 
 def test_broken_scans_stop_the_fit_or_are_not_trusted(
@@ -225,6 +289,8 @@ def test_several_persons_and_different_persons(
         ({"workers": -1}, "workers: wanted"),
         ({"scale": "inch"}, "data.scale: wanted auto or metres per unit"),
         ({"up": "x"}, "data.up: wanted auto, y or z, got 'x'"),
+        ({"body": "a.npz", "skeleton": "b.glb"}, "body, skeleton: wanted at most one of them, got both"),
+        ({"skeleton": "b.glb"}, "b.glb"),
         ({"body": "nobody.npz"}, "no body model at nobody.npz"),
         ({"gender": "none"}, "gender: wanted neutral, female or male"),
     ],

@@ -16,9 +16,11 @@ from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError
-from snarfcli.registration.scan_files import examine_files, fingerprint
+from snarfcli.files import write_arrays
+from snarfcli.registration.scan_files import examine_files, fingerprint, list_scans, read_scan
 from snarfcli.registration.scans import ScanSequence, find_scans, scan_subjects
 from snarfcli.registration.surroundings import Floor
+from snarfcli.sampling import oriented_surface_samples
 
 
 def request(root: Path, folder: Path | None = None) -> Request:
@@ -76,6 +78,27 @@ def test_frames_are_points_in_metres_with_y_up(tmp_path):
     np.testing.assert_array_equal(scans.chosen([1])[0].points.shape, scan.points.shape)
 
 
+def test_point_clouds_get_normals_where_they_have_none_or_wrong_ones(tmp_path):
+    vertices, faces = toy_mesh(np.zeros((24, 3)), np.zeros(3))
+    points, normals = oriented_surface_samples(vertices, faces, 2000, np.random.default_rng(0))
+    np.savez(tmp_path / "0.npz", points=points, normals=normals)
+    np.savez(tmp_path / "1.npz", points=points)
+    mixed = normals * np.where(np.arange(2000) % 2, 1, -1)[:, None]
+    np.savez(tmp_path / "2.npz", points=points, normals=mixed)
+    write_arrays(tmp_path / "poses.npz", {"poses": np.zeros((3, 24, 3))})  # is no scan
+    paths = tuple(list_scans(tmp_path))
+    assert [path.name for path in paths] == ["0.npz", "1.npz", "2.npz"]
+    assert [read_scan(path, 1500, 0, check_normals=True)[2] for path in paths] == [
+        "", "", "pointed to both sides and were turned outward"
+    ]  # fmt: skip
+    scans = ScanSequence(paths, FileToWorld(1, "y"), 1500, checks_normals=True)
+    for index, least in enumerate((1.0, 0.9, 0.9)):
+        scan = scans[index]
+        true = normals[KDTree(points).query(scan.points)[1]]
+        assert ((scan.normals * true).sum(1) > 0).mean() >= least
+    assert not any(facts.topology or facts.problem for facts in examine_files(paths))
+
+
 def test_inside_out_meshes_are_turned(tmp_path):
     vertices, faces = toy_mesh(np.zeros((24, 3)), np.zeros(3))
     trimesh.Trimesh(vertices, faces[:, ::-1], process=False).export(tmp_path / "0.ply")
@@ -98,7 +121,7 @@ def test_a_floor_is_left_out_but_not_everything(tmp_path):
 
 
 def test_files_that_cannot_be_used_are_told_without_an_error(tmp_path):
-    write_scans(tmp_path / "walk", 2)
+    write_scans(tmp_path / "walk", 2, one_topology=True)
     (tmp_path / "walk" / "2.ply").write_bytes(b"ply\nnothing")
     trimesh.PointCloud(floor(0.0)[0][:100]).export(tmp_path / "walk" / "3.ply")
     damaged = trimesh.load_mesh(tmp_path / "walk" / "0.ply", process=False)

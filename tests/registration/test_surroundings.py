@@ -56,6 +56,7 @@ def test_a_gap_and_stray_points_do_not_split_a_person():
     parts = find_parts(np.concatenate([away, stray]))
     assert len(parts) == 1
     assert parts[0].is_in[: len(away)].all()
+    assert len(find_parts(np.random.default_rng(4).uniform(0, 1, (300, 3)) * 50)) >= 1  # a cloud of single points
     assert find_parts(points[:500])[0].is_in.sum() > 490  # few points
 
 

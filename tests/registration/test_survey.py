@@ -65,6 +65,6 @@ def test_a_second_person_and_a_thing_are_told_apart():
     found = survey(together((points, normals), small))
     assert found.has_parts == {0}
     assert not found.others
-    assert "left out: things apart from the subject, up to 0.3" in found.facts[-1]
+    assert "left out: things apart from the subject, up to 0.3" in found.facts[-2]
     two = survey(together((points, normals), (points + np.array([1.9, 0, 0]), normals)))
     assert [len(cloud[0]) for cloud in two.others] == [3000]

@@ -62,24 +62,25 @@ def test_the_files_are_those_of_a_subject(tmp_path: Path, scale: float, up: str)
 def test_a_fit_reads_its_own_files_only(tmp_path: Path) -> None:
     made = FitMade(BETAS, FileToWorld(0.01, "z"), SETTINGS)
     assert read_made(tmp_path) is None
-    assert read_fitted(tmp_path, made) is None
+    assert read_fitted(tmp_path, made, 24) is None
     write_skeleton(tmp_path, builtin_body().skeleton(BETAS), made)
     write_fitted(tmp_path, fitted(), made, 30.0)
     again = read_made(tmp_path)
     assert again is not None
     assert again.digest == made.digest
-    there = read_fitted(tmp_path, made)
+    there = read_fitted(tmp_path, made, 24)
     assert there is not None
     np.testing.assert_allclose(there.poses, fitted().poses, atol=1e-12)
     np.testing.assert_allclose(there.translation, fitted().translation, atol=1e-12)
     assert there.reasons == ("far away", "")
+    assert read_fitted(tmp_path, made, 23) is None
     assert not foreign_files(tmp_path, [tmp_path])
-    assert read_fitted(tmp_path, FitMade(BETAS + 0.1, made.world, SETTINGS)) is None
-    assert read_fitted(tmp_path, FitMade(BETAS, made.world, {**SETTINGS, "seed": 1})) is None
+    assert read_fitted(tmp_path, FitMade(BETAS + 0.1, made.world, SETTINGS), 24) is None
+    assert read_fitted(tmp_path, FitMade(BETAS, made.world, {**SETTINGS, "seed": 1}), 24) is None
     for name in ("skeleton.npz", "poses.npz"):
         (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-200])
     assert read_made(tmp_path) is None
-    assert read_fitted(tmp_path, made) is None
+    assert read_fitted(tmp_path, made, 24) is None
 
 
 def test_files_of_others_are_found_and_replaced(tmp_path: Path) -> None:

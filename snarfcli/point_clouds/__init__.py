@@ -1,0 +1,17 @@
+"""Points on the surface of something: their files, their normals, and the closed surface around them."""
+
+import snarfcli.extras.commands  # noqa: F401 - raises MissingPackage
+from snarfcli.point_clouds.closing import close_surface
+from snarfcli.point_clouds.files import PointFile, list_frames, read_frame, read_points
+from snarfcli.point_clouds.normals import CheckedNormals, check_normals, estimate_normals
+
+__all__ = [
+    "CheckedNormals",
+    "PointFile",
+    "check_normals",
+    "close_surface",
+    "estimate_normals",
+    "list_frames",
+    "read_frame",
+    "read_points",
+]

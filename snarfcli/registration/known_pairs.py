@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface
-from snarfcli.registration.rotations import project_to_rotations, vector_to_matrix
+from snarfcli.registration.rotations import nearest_rotations, project_to_rotations, vector_to_matrix
 
 __all__ = ["KnownPairs", "PairedPoses"]
 
@@ -105,7 +105,7 @@ class KnownPairs:
         rotations = np.empty_like(turns)
         for joint, parent in enumerate(self._surface.parents):
             above = turns[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), (frames, 3, 3))
-            turns[:, joint] = _nearest_rotations(spread[joint] + _LIKE_PARENT * above)
+            turns[:, joint] = nearest_rotations(spread[joint] + _LIKE_PARENT * above)
             rotations[:, joint] = above.transpose(0, 2, 1) @ turns[:, joint]
         return rotations
 
@@ -190,14 +190,6 @@ class KnownPairs:
         turns = self._transforms(rotations, np.zeros((frames, 3)))[0]
         blended = (surface.weights @ turns.reshape(frames, -1, 9)).reshape(frames, -1, 3, 3)
         return (blended @ offsets.reshape(frames, -1, 3, 1))[..., 0]
-
-
-def _nearest_rotations(matrices: Array) -> Array:
-    """Return the rotations [..., 3, 3] that have the largest product with matrices, none of them a reflection."""
-    u, _, v = np.linalg.svd(matrices)
-    sign = np.linalg.det(u @ v)
-    u[..., :, 2] *= sign[..., None]
-    return u @ v
 
 
 def _cross_matrices(vectors: Array) -> Array:

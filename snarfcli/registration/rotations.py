@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = ["matrix_to_vector", "project_to_rotations", "vector_to_matrix"]
+__all__ = ["matrix_to_vector", "nearest_rotations", "project_to_rotations", "vector_to_matrix"]
 
 Array = NDArray[np.float64]
 
@@ -25,4 +25,11 @@ def matrix_to_vector(matrices: Array) -> Array:
 def project_to_rotations(matrices: Array) -> Array:
     """Return the rotations closest to matrices [..., 3, 3] that differ from rotations by rounding only."""
     u, _, v = np.linalg.svd(matrices)
+    return u @ v
+
+
+def nearest_rotations(matrices: Array) -> Array:
+    """Return the rotations [..., 3, 3] closest to any matrices, none of them a reflection (Kabsch 1976)."""
+    u, _, v = np.linalg.svd(matrices)
+    u[..., :, 2] *= np.linalg.det(u @ v)[..., None]
     return u @ v

@@ -23,14 +23,15 @@ _NOISE_M = 0.003  # by which points leave the places to which skinning moves the
 _SHORTEST_OFFSET_M, _LONGEST_OFFSET_M = 0.003, 0.01  # about how long offsets are, without clothes
 _PINNED = 1e3  # weight of offsets that are none
 _MOVING_M = 0.005  # a point that moves so far against the body counts a quarter, or of three times the median if that is more
-_LEAST_VOLUME = 0.3  # a point that skinning squeezes to less than this share in some frame says nothing about the others
-_REGULAR = 1e-9  # keeps points at which skinning is singular, those of a part turned by 180 degrees, from being an error
-_STEPS = 8
-_STEADY = 1e-4  # largest change of a turn, radians, or of a place or shape, after which no more steps are taken
+_LEAST_VOLUME = 0.3  # a point that skinning squeezes to less than this share in some frame says less about the others,
+_LEAST_USABLE = 0.05  # but at least so much, or a joint that only moves such points would be free
+_REGULAR = 1e-3  # of the inverse of the skinning, which is singular at some points of a part that is turned by 180 degrees
+_STEPS = 12
+_LEAST_GAIN = 1e-8  # squared metres; no more steps are taken after one of less
 _POINTS = 600  # that take part in the joint steps; the offsets of all follow
 _SHAPE_PRIOR = 1e-6  # as in the solver
-_DAMPING = 1e-7  # relative to the mean of the diagonal
-_LONGEST_BETA = 1.0  # in one step
+_DAMPING = 1e-5  # relative to the mean of the diagonal
+_LONGEST_TURN_RAD, _LONGEST_SHIFT_M, _LONGEST_BETA = 0.35, 0.2, 1.0  # in one step
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +159,10 @@ def unposed(surface: BodySurface, state: BodyState, points: Array) -> tuple[Arra
 
 
 def _blended(surface: BodySurface, posed: PosedSurface) -> tuple[Array, Array]:
-    """Return the matrices [K, 3, 3] with which skinning moves the points, and their inverses."""
+    """Return the matrices [K, 3, 3] with which skinning moves the points, and their regular inverses."""
     blended = (surface.weights @ posed.turns.reshape(-1, 9)).reshape(-1, 3, 3)
-    return blended, np.asarray(np.linalg.inv(blended + _REGULAR * np.eye(3)), np.float64)
+    across = blended.transpose(0, 2, 1)
+    return blended, np.linalg.solve(across @ blended + _REGULAR * np.eye(3), across)
 
 
 def refine(
@@ -191,14 +193,14 @@ def refine(
     offset_weight = _PINNED if body is None else np.square(_NOISE_M / (_LONGEST_OFFSET_M + clothes_m))
     attached = with_mean_offsets(attached, states, frames, offset_weight)
     for _ in range(_STEPS):
-        states, change = _joint_step(attached.first(_POINTS), states, frames[:, :_POINTS], offset_weight, shape_is_free)
+        states, gain = _joint_step(attached.first(_POINTS), states, frames[:, :_POINTS], offset_weight, shape_is_free)
         if body is not None:
             attached = _attached_again(body, attached, states[0].betas)
             usual = float(np.median(np.linalg.norm(attached.offsets, axis=1)))
             usual = min(max(usual, _SHORTEST_OFFSET_M + clothes_m), _LONGEST_OFFSET_M + clothes_m)
             offset_weight = np.square(_NOISE_M / usual)
         attached = with_mean_offsets(attached, states, frames, offset_weight)
-        if change < _STEADY:
+        if gain < _LEAST_GAIN:
             break
     return attached, states
 
@@ -219,8 +221,9 @@ def with_mean_offsets(
     mean = offsets.sum(0) / (len(frames) + offset_weight)
     moving = np.sqrt(np.square(offsets - mean).sum(2).mean(0))
     scale = max(_MOVING_M, 3 * float(np.median(moving)))
-    is_usable = np.stack([volume for _, volume in pairs]).min(0) > _LEAST_VOLUME
-    return attached.moved(mean, is_usable / np.square(1 + np.square(moving / scale)))
+    volume = np.stack([volume for _, volume in pairs]).min(0)
+    usable = np.clip(volume / _LEAST_VOLUME, _LEAST_USABLE, 1.0)
+    return attached.moved(mean, usable / np.square(1 + np.square(moving / scale)))
 
 
 def _joint_step(
@@ -229,7 +232,7 @@ def _joint_step(
     """Take one Gauss-Newton step of all poses and the shape; the offsets, which follow from them, are eliminated.
 
     Returns:
-        The states, and the largest change of a number.
+        The states, and by how much the mean of the squared distances should shrink by the step, doubled, squared metres.
     """
     surface = attached.surface
     turns, count = 3 * surface.num_joints, 3 * surface.num_joints + 3
@@ -259,9 +262,11 @@ def _joint_step(
     change = -np.linalg.solve(system, gradient)
     new_betas = states[0].betas.copy()
     new_betas[:betas] += np.clip(change[shape], -_LONGEST_BETA, _LONGEST_BETA)
+    by_frame = change[: shape.start].reshape(len(states), count)
+    by_frame[:, :turns] = np.clip(by_frame[:, :turns], -_LONGEST_TURN_RAD, _LONGEST_TURN_RAD)
+    by_frame[:, turns:] = np.clip(by_frame[:, turns:], -_LONGEST_SHIFT_M, _LONGEST_SHIFT_M)
     moved = []
-    for number, (state, posed) in enumerate(zip(states, posed_frames, strict=True)):
-        own = change[number * count : (number + 1) * count]
+    for state, posed, own in zip(states, posed_frames, by_frame, strict=True):
         turned = surface.turned(state, posed, own[:turns].reshape(-1, 3))
         moved.append(BodyState(turned, state.translation + own[turns:], new_betas))
-    return moved, float(np.abs(change).max())
+    return moved, float(-gradient @ change) / len(states)

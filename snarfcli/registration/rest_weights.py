@@ -16,8 +16,8 @@ __all__ = ["weights_of_bones"]
 
 Array = NDArray[np.float64]
 
-# The mean sum of differences from the weights of five artists' rigs, at most 2, is 0.39 to 0.56; with twice the fall-off 0.50 to
-# 0.80.
+# The mean sum of differences from the weights of five artists' rigs, at most 2, is 0.39 to 0.56;
+# with twice the fall-off, 0.50 to 0.80.
 _FALLOFF = 0.005  # share of the longest side of the mesh over which a weight falls by a factor e
 _BLEND = 0.02  # share of it over which weights then spread along the surface, which blends them at joints, not between limbs
 

@@ -43,7 +43,7 @@ def joint_errors_m(surface, attached, betas, frames, true) -> np.ndarray:
 def test_attached_points_are_where_the_scan_is(surface, true, frames):
     attached = attach(surface, true[:1], frames[:1], builtin_body().faces.numpy(), 300)
     posed = attached.surface.posed(true[0])
-    np.testing.assert_allclose(posed.points, frames[0, attached.surface.vertex_numbers], atol=1e-9)
+    np.testing.assert_allclose(posed.points, frames[0, attached.surface.vertex_numbers], atol=1e-4)  # by the regular inverse
     assert np.linalg.norm(attached.offsets, axis=1).mean() < 0.006  # to the mean of four vertices
     assert joint_errors_m(surface, attached, BETAS, frames, true).max() < 0.004
 

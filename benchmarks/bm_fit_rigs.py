@@ -1,12 +1,12 @@
 """How well rigs are fitted to unordered points of their own motions: animals and other characters in glTF files.
 
     python benchmarks/bm_fit_rigs.py RIGS --clips Walk Run --frames 60
-    python benchmarks/bm_fit_rigs.py RIGS --own-clips
+    python benchmarks/bm_fit_rigs.py RIGS --known others
 
 Every frame of a motion becomes 4,000 points on the surface of the posed mesh, 1.8 m long, in random order. The rig, which is
 10 % too small at first, is fitted to them: from nowhere in a few frames, then from frame to frame. The poses that are known at
-the start are the rest pose alone or, with `--own-clips`, those of all motions of the rig. Distances are those of the joints
-that move a part of the mesh, in millimetres.
+the start are the rest pose alone, or also those of the rig's other motions, or of all. Distances are those of the joints that
+move a part of the mesh, in millimetres. With `--vertices`, the vertices of the posed mesh are given in their order instead.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from snarfcli.datasets.posed_meshes import RigMeshes
 from snarfcli.datasets.rigged import RIG_SUFFIXES, read_rigged_files
 from snarfcli.registration.body_surface import BodyState
-from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.rigs import RigSurface, read_rig
 from snarfcli.registration.same_topology import fit_one_topology
 from snarfcli.registration.scan_points import ScanPoints
@@ -35,6 +34,7 @@ from snarfcli.registration.tracker import FittedSequence, fit_sequence
 
 __all__ = ["RigClipCase", "cases", "errors_mm", "follow", "follow_vertices"]
 
+KNOWN = ("rest", "others", "all")
 _LENGTH_M = 1.8
 _TOO_SMALL = 0.9
 _POINTS = 4000
@@ -47,6 +47,7 @@ class RigClipCase:
     """One motion of one rig."""
 
     name: str
+    motion: str
     rig: RigSurface
     """As long as a person."""
     meshes: RigMeshes
@@ -76,14 +77,15 @@ def cases(folder: Path, clips: Sequence[str], frames: int) -> Iterator[RigClipCa
             moved = clip.posed_from_rest[:frames].copy()
             moved[..., :3, 3] *= scale
             joints = np.einsum("tjab,jb->tja", moved[..., :3, :3], rest) + moved[..., :3, 3]
-            yield RigClipCase(f"{path.stem} {name}", rig, RigMeshes(rig.vertices, rig.faces, rig.weights, moved), joints)
+            yield RigClipCase(f"{path.stem} {name}", name, rig, RigMeshes(rig.vertices, rig.faces, rig.weights, moved), joints)
 
 
-def follow(case: RigClipCase, own_clips: bool) -> FittedSequence:
-    """Fit a rig that is too small to the unordered points of a motion."""
+def follow(case: RigClipCase, known: str) -> FittedSequence:
+    """Fit a rig that is too small to the unordered points of a motion; `known` is one of `KNOWN`."""
     rig = case.rig.resized(_TOO_SMALL)
     surface, prior = rig.surface(_VERTICES), PosePrior.weak(rig.skeleton.num_joints)
-    library = rig.library if own_clips else PoseLibrary.of_rig(rig.skeleton.num_joints)
+    unknown = {"rest": [name for name, _ in rig.motions], "others": [case.motion], "all": []}[known]
+    library = rig.library_without(unknown)
     return fit_sequence(surface, case, PoseFinder(surface, library, prior), prior, betas=None)
 
 
@@ -111,14 +113,14 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="folder of rigged glTF files")
     parser.add_argument("--clips", nargs="*", default=(), help="motions (default: all)")
     parser.add_argument("--frames", type=int, default=60, help="maximum number of frames of a motion")
-    parser.add_argument("--own-clips", action="store_true", help="start from the poses of all motions of the rig")
+    parser.add_argument("--known", choices=KNOWN, default="rest", help="poses to start from: of which of the rig's motions")
     parser.add_argument("--vertices", action="store_true", help="fit to the vertices in their order instead")
     options = parser.parse_args()
     print_machine()
     rows = []
     for case in cases(options.folder, options.clips, options.frames):
         started = time.process_time()
-        fitted = follow_vertices(case) if options.vertices else follow(case, options.own_clips)
+        fitted = follow_vertices(case) if options.vertices else follow(case, options.known)
         seconds = (time.process_time() - started) / len(case)
         errors = errors_mm(case, fitted)
         rows.append(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -55,8 +55,8 @@ class RigSurface:
     """[F, 3], outward."""
     weights: Array
     """[V, J], rows sum to 1."""
-    poses: Array
-    """[L, J, 3], of the rig's own motions, axis-angle, radians."""
+    motions: tuple[tuple[str, Array], ...]
+    """Names and poses [L, J, 3] of the rig's own motions, axis-angle, radians, some per second."""
     source: str
     """What was read, for messages."""
 
@@ -68,7 +68,12 @@ class RigSurface:
     @cached_property
     def library(self) -> PoseLibrary:
         """The rest pose and the poses of the rig's own motions."""
-        return PoseLibrary.of_rig(self.skeleton.num_joints, self.poses if len(self.poses) else None)
+        return self.library_without(())
+
+    def library_without(self, names: Collection[str]) -> PoseLibrary:
+        """Return the rest pose and the poses of the rig's own motions, without some of these."""
+        poses = [poses for name, poses in self.motions if name not in names]
+        return PoseLibrary.of_rig(self.skeleton.num_joints, np.concatenate(poses) if poses else None)
 
     def surface(self, count: int) -> BodySurface:
         """Return `count` vertices, spread evenly, with the size as the only shape parameter (see `SIZE_PER_BETA`)."""
@@ -134,14 +139,14 @@ def read_rig(path: str | Path, mesh: str | Path | None = None) -> RigSurface:
 def _rig_of_gltf(path: Path) -> RigSurface:
     rigged = read_rigged_files([path])
     skeleton = _skeleton(rigged.skeleton, FileToWorld(1.0, "y"), rigged.skeleton.idle)
-    poses = [
-        _poses(clip.posed_from_rest[:: max(1, round(clip.frame_rate / _POSES_PER_S))], skeleton)
-        for _, clip in rigged.clips
+    motions = tuple(
+        (name, _poses(clip.posed_from_rest[:: max(1, round(clip.frame_rate / _POSES_PER_S))], skeleton))
+        for name, clip in rigged.clips
         if clip.posed_from_rest is not None
-    ]
-    joints, motions = counted(skeleton.num_joints, "joint"), counted(len(poses), "motion")
-    source = f"rig {path}: {joints}, {len(rigged.mesh.vertices)} vertices, {motions}"
-    return _rig(path, skeleton, rigged.mesh.vertices, rigged.mesh.faces, rigged.mesh.weights, poses, source)
+    )
+    joints, count = counted(skeleton.num_joints, "joint"), counted(len(motions), "motion")
+    source = f"rig {path}: {joints}, {len(rigged.mesh.vertices)} vertices, {count}"
+    return _rig(path, skeleton, rigged.mesh.vertices, rigged.mesh.faces, rigged.mesh.weights, motions, source)
 
 
 def _rig_of_skeleton(path: Path, mesh: Path | None) -> RigSurface:
@@ -173,7 +178,7 @@ def _rig_of_skeleton(path: Path, mesh: Path | None) -> RigSurface:
         weights = weights_of_bones(skeleton, vertices, faces)
     idle = tuple(np.flatnonzero(~np.any(weights > 0, axis=0)).tolist())
     source = f"rig {path}: {counted(skeleton.num_joints, 'joint')}, {len(vertices)} vertices of {where}, {made}"
-    return _rig(path, replace(skeleton, idle=idle), vertices, faces, weights, [], source)
+    return _rig(path, replace(skeleton, idle=idle), vertices, faces, weights, (), source)
 
 
 def _given_weights(own: NamedValues, vertices: int, file: SkeletonFile) -> Array:
@@ -190,12 +195,17 @@ def _given_weights(own: NamedValues, vertices: int, file: SkeletonFile) -> Array
 
 
 def _rig(
-    path: Path, skeleton: Skeleton, vertices: Array, faces: NDArray, weights: Array, poses: list[Array], source: str
+    path: Path,
+    skeleton: Skeleton,
+    vertices: Array,
+    faces: NDArray,
+    weights: Array,
+    motions: tuple[tuple[str, Array], ...],
+    source: str,
 ) -> RigSurface:
     if not np.ptp(vertices, axis=0).max(initial=0.0) > 0:
         raise UserError(f"skeleton {path}: wanted a mesh with an extent, got one without; export it again")
-    own = np.concatenate(poses) if poses else np.zeros((0, skeleton.num_joints, 3))
-    return RigSurface(skeleton, np.asarray(vertices, np.float64), np.asarray(faces, np.int64), weights, own, source)
+    return RigSurface(skeleton, np.asarray(vertices, np.float64), np.asarray(faces, np.int64), weights, motions, source)
 
 
 def _skeleton(file: SkeletonFile, world: FileToWorld, idle: tuple[int, ...]) -> Skeleton:

@@ -51,12 +51,13 @@ def test_a_rigged_file_gives_joints_weights_and_poses(rig, animal):
     assert rig.skeleton.parents == animal.parents
     np.testing.assert_allclose(rig.skeleton.joints_rest.numpy(), animal.joints, atol=1e-6)
     assert rig.vertices.shape == animal.vertices.shape
-    assert rig.poses.shape == (24, 19, 3)  # 48 frames of each motion at 30 per second, 7.5 of them per second
+    assert [(name, poses.shape) for name, poses in rig.motions] == [("walk", (12, 19, 3)), ("sit", (12, 19, 3))]  # 7.5 a second
     assert len(rig.library.poses) == 25
+    assert len(rig.library_without(["walk"]).poses) == 13
     assert "19 joints" in rig.source
     assert "2 motions" in rig.source
     walk = animal_motion("walk").poses[::4]
-    np.testing.assert_allclose(vector_to_matrix(rig.poses[:12]), vector_to_matrix(walk), atol=1e-5)
+    np.testing.assert_allclose(vector_to_matrix(rig.motions[0][1]), vector_to_matrix(walk), atol=1e-5)
 
 
 def test_the_size_is_the_shape(rig, animal):
@@ -117,9 +118,10 @@ def test_a_root_that_moves_nothing_does_not_turn(animal, tmp_path):
     (tmp_path / "animal.glb").write_bytes(animal_glb(above, [type(motion)("sit", poses, motion.translation)]))
     rig = read_rig(tmp_path / "animal.glb")
     assert rig.skeleton.idle == (0,)
-    np.testing.assert_allclose(rig.poses[:, 0], motion.poses[::4, 0], atol=1e-5)
-    np.testing.assert_allclose(rig.poses[:, 1], 0, atol=1e-6)
-    np.testing.assert_allclose(rig.poses[:, 2:], motion.poses[::4, 1:], atol=1e-5)
+    ((_, found),) = rig.motions
+    np.testing.assert_allclose(found[:, 0], motion.poses[::4, 0], atol=1e-5)
+    np.testing.assert_allclose(found[:, 1], 0, atol=1e-6)
+    np.testing.assert_allclose(found[:, 2:], motion.poses[::4, 1:], atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".json"])
@@ -130,7 +132,7 @@ def test_a_skeleton_file_with_its_own_mesh(animal, tmp_path, suffix):
     np.testing.assert_allclose(rig.vertices, 2 * animal.vertices)
     np.testing.assert_allclose(rig.skeleton.joints_rest.numpy(), 2 * animal.joints)
     np.testing.assert_allclose(rig.weights, animal.weights, atol=1e-9)
-    assert rig.poses.shape == (0, 19, 3)
+    assert rig.motions == ()
     assert len(rig.library.poses) == 1
 
 

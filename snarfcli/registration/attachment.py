@@ -17,6 +17,7 @@ __all__ = ["AttachedPoints", "attach", "refine", "with_mean_offsets"]
 Array = NDArray[np.float64]
 
 _PER_POINT = ("points_rest", "points_by_beta", "normals_rest", "weights", "correctives")
+_SPREAD_FROM = 20_000  # vertices, of which those to attach are chosen
 _NEIGHBOURS = 4  # vertices of the body that a vertex of the scan follows
 _NEAR_M = 0.01  # neighbours that are closer than this count about alike
 _NOISE_M = 0.003  # by which points leave the places to which skinning moves them
@@ -75,6 +76,8 @@ def attach(
         count: number of vertices to attach, spread evenly.
     """
     used = np.unique(faces)
+    if len(used) > _SPREAD_FROM:
+        used = np.random.default_rng(0).permutation(used)[:_SPREAD_FROM]
     chosen = used[farthest_points(frames[0][used], count)]
     best, found = np.full(len(chosen), np.inf), None
     for state, vertices in zip(states, frames, strict=True):
@@ -112,7 +115,8 @@ def _interpolated(surface: BodySurface, tree: KDTree, features: Array) -> tuple[
         tree: of the places and scaled normals of its vertices, in any pose.
         features: [K, 6], those of the points in this pose.
     """
-    distances, near = (np.asarray(found) for found in tree.query(features, _NEIGHBOURS))  # [K, 4]
+    found = tree.query(features, min(_NEIGHBOURS, tree.n))
+    distances, near = (np.asarray(part).reshape(len(features), -1) for part in found)  # [K, 4]
     share = 1 / (np.square(distances) + _NEAR_M**2)
     share /= share.sum(1, keepdims=True)
     mixed = {name: np.einsum("kn,kn...->k...", share, getattr(surface, name)[near]) for name in _PER_POINT}

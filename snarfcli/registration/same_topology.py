@@ -30,6 +30,7 @@ Refit = Callable[[int, Sequence[BodyState]], Found | None]
 _POINTS = 2000  # vertices of a frame that are followed
 _PROBES = 40  # frames, evenly spread, of which the most different serve to find shape and offsets
 _KEY_FRAMES = 10
+_FIRST = 5  # frames, one of which is that to which the others are compared
 _EDGES = 2000  # that are measured in every frame
 _STRETCHED = 2.0  # an edge that is longer or shorter by this factor does not join the same two points of a surface
 _MOST_STRETCHED = 0.1  # share of such edges; cloth of simulations and skin near joints have 1 %
@@ -47,17 +48,20 @@ class EdgeLengths:
     Args:
         vertices: [V, 3], of the first frame.
         faces: [F, 3].
+
+    Attributes:
+        vertices: V.
     """
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
-        self._shape = vertices.shape
+        self.vertices = len(vertices)
         some = np.linspace(0, len(faces) - 1, min(_EDGES, len(faces))).astype(np.intp)
         self._edges = np.unique(np.sort(np.concatenate([faces[some][:, :2], faces[some][:, 1:]]), 1), axis=0)
         self._lengths = self._measured(vertices)
 
     def fit(self, vertices: NDArray) -> bool:
         """Return whether the edges of a frame are about as long as those of the first."""
-        if vertices.shape != self._shape or not np.isfinite(vertices).all():
+        if vertices.shape != (self.vertices, 3) or not np.isfinite(vertices).all():
             return False
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = self._measured(vertices) / self._lengths
@@ -205,14 +209,14 @@ def prepare_follower(
         clothes_m: how far the body may be below the surface, metres.
 
     Raises:
-        ValueError: there are no states, and the topology is not the body's own.
+        ValueError: there are no states, and the topology is not the body's own; or no frame has the vertices of the faces.
     """
-    is_own = is_own_topology(surface_faces, len(frames[0]), faces)
-    if not is_own and not states:
-        raise ValueError("states: wanted those of some frames, since the topology is not that of the body, got none")
-    edges = EdgeLengths(frames[0], faces)
+    edges = _usual_edges(frames, faces)
     is_known = [edges.fit(vertices) for vertices in frames]
     states = [state for state, known in zip(states, is_known, strict=False) if known]
+    is_own = is_own_topology(surface_faces, edges.vertices, faces)
+    if not is_own and not states:
+        raise ValueError("states: wanted those of some frames, since the topology is not that of the body, got none")
     frames = [np.asarray(vertices, np.float64) for vertices, known in zip(frames, is_known, strict=True) if known]
     if betas is not None:
         shape = betas
@@ -238,6 +242,15 @@ def prepare_follower(
         )
     shape = key_states[0].betas
     return TopologyFollower(attached, shape, edges, _mean_distance(attached, shape, points))
+
+
+def _usual_edges(frames: Sequence[NDArray], faces: NDArray) -> EdgeLengths:
+    """Return the edges of the one of the first frames that most frames agree with."""
+    whole = [vertices for vertices in frames if len(vertices) > faces.max() and np.isfinite(vertices).all()]
+    if not whole:
+        raise ValueError(f"frames: wanted finite vertices, more than {faces.max()}, got none")
+    tries = [EdgeLengths(vertices, faces) for vertices in whole[:_FIRST]]
+    return max(tries, key=lambda edges: sum(edges.fit(vertices) for vertices in frames))
 
 
 def _mean_distance(attached: AttachedPoints, betas: Array, points: Array) -> float:

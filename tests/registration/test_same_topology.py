@@ -121,6 +121,15 @@ def test_permuted_and_other_frames_are_noticed_and_fitted_alone(surface, frames,
     assert errors_m(surface, fitted, true)[[4, 7]].max() < 1e-6
 
 
+def test_a_first_frame_that_differs_from_all_others(surface, frames):
+    broken = [np.full_like(frames[0], np.nan), frames[0][::-1], *frames[:3]]
+    follower = prepare_follower(surface, FACES, FACES, broken, [], betas=BETAS)
+    fitted = follower.follow(lambda frame: broken[frame], 5)
+    assert fitted.is_trusted.tolist() == [False, False, True, True, True]
+    with pytest.raises(ValueError, match="wanted finite vertices"):
+        prepare_follower(surface, FACES, FACES, broken[:1], [], betas=BETAS)
+
+
 def test_frames_that_do_not_move_like_the_body_are_not_trusted(surface, frames):
     follower = prepare_follower(surface, FACES, FACES, list(frames[:4]), [], betas=BETAS)
     bent = frames[6] + np.array([0, 0, 0.2]) * np.sin(4 * frames[6][:, 1:2])

@@ -124,12 +124,12 @@ class _Tracker:
             self.offer(index, self._found(index, ()))
         suspicious = is_suspicious(self.misfit)
         looks = np.stack([_look(self.scan(index)) for index in range(len(self.scans))])
-        for index in np.flatnonzero(suspicious):
+        for index in np.flatnonzero(suspicious).tolist():
             apart = np.where(suspicious, np.inf, np.abs(looks - looks[index]).sum(1))
-            for other in np.argsort(apart)[:_ALIKE]:
-                state = self._state(int(other))
-                moved = replace(state, translation=state.translation + self.scan(index).centre - self.scan(int(other)).centre)
-                self.offer(int(index), self._fitted(int(index), moved, _WIDE_M))
+            for other in np.argsort(apart)[:_ALIKE].tolist():
+                state = self._state(other)
+                moved = replace(state, translation=state.translation + self.scan(index).centre - self.scan(other).centre)
+                self.offer(index, self._fitted(index, moved, _WIDE_M))
 
     def follow_all(self) -> None:
         """Follow the body from the best seed through all frames, and from the others where they are better."""

@@ -8,13 +8,13 @@ both sides, limb by limb, and from nowhere. Every frame keeps the state with the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface
+from snarfcli.registration.fitted_sequence import Finder, FittedSequence, Found, Scans
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import different_frames, fit_shape
 from snarfcli.registration.solver import Agreement, PosePrior, agreement, fit_state, scales
@@ -34,53 +34,10 @@ _POLISH_M = scales(0.045, 0.025, 5)
 _LOST = 1.3  # times the usual misfit: the step to this frame is tried again with longer scales
 _BETTER = 0.98  # times the misfit of the state that is replaced
 _SAME = 3  # frames without gain after which following a better state ends
+_ALIKE = 3  # frames from which a suspicious one is fitted where frames have no order
+_LOOKS = 200  # points of a scan from which its look is made
 _ROUNDS = 3  # of fitting suspicious frames again
 _FINDS_PER_FRAME = 0.1  # searches from nowhere that a sequence may cost, per frame
-
-
-class Scans(Protocol):
-    """The scans of one sequence, loaded frame by frame."""
-
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int, /) -> ScanPoints: ...
-
-
-class Found(Protocol):
-    """A state, and how well it agrees with its scan."""
-
-    @property
-    def state(self) -> BodyState: ...
-    @property
-    def agreement(self) -> Agreement: ...
-
-
-class Finder(Protocol):
-    """Fits single frames, as `PoseFinder` does."""
-
-    def find(
-        self, scan: ScanPoints, *, betas: Array | None = None, clothes_m: float = 0.0, near: Sequence[BodyState] = ()
-    ) -> Found: ...
-    def recover(self, scan: ScanPoints, state: BodyState, *, clothes_m: float = 0.0) -> Found: ...
-
-
-@dataclass(frozen=True)
-class FittedSequence:
-    """A body in all frames of a sequence."""
-
-    poses: Array
-    """[T, J, 3], axis-angle, radians."""
-    translation: Array
-    """[T, 3], metres."""
-    betas: Array
-    """[S], shape parameters."""
-    residual_m: Array
-    """[T], mean distance of both sides, metres."""
-    objective: Array
-    """[T], as in `Agreement`."""
-    is_trusted: NDArray[np.bool_]
-    """[T]."""
-    reasons: tuple[str, ...]
-    """Why a frame is not trusted; "" if it is."""
 
 
 def fit_sequence(
@@ -112,9 +69,13 @@ def fit_sequence(
     if not len(scans):
         raise ValueError("scans: wanted at least one frame, got none")
     tracker = _Tracker(surface, scans, finder, prior, clothes_m)
-    tracker.find_seeds(betas if surface.num_betas else np.zeros(0))
+    known = betas if surface.num_betas else np.zeros(0)
+    if not is_ordered:
+        tracker.find_each(known)
+        return tracker.polished(on_frame, is_ordered=False)
+    tracker.find_seeds(known, _SEEDS)
     tracker.follow_all()
-    if betas is None and surface.num_betas:
+    if known is None:
         tracker.fit_shape()
     for _ in range(_ROUNDS):
         if not tracker.repair():
@@ -142,9 +103,9 @@ class _Tracker:
             self._loaded[index] = self.scans[index]
         return self._loaded[index]
 
-    def find_seeds(self, betas: Array | None) -> None:
+    def find_seeds(self, betas: Array | None, count: int) -> None:
         """Fit a few frames from nowhere; without `betas`, give them a shape in common."""
-        count = min(_SEEDS, len(self.scans))
+        count = min(count, len(self.scans))
         self.seeds = [(2 * number + 1) * len(self.scans) // (2 * count) for number in range(count)]
         found = [self.finder.find(self.scan(index), betas=betas, clothes_m=self.clothes_m).state for index in self.seeds]
         if betas is None:
@@ -155,6 +116,20 @@ class _Tracker:
             self.betas = betas
         for index, state in zip(self.seeds, found, strict=True):
             self.offer(index, state)
+
+    def find_each(self, betas: Array | None) -> None:
+        """Fit every frame from nowhere, and the suspicious ones from those whose scans are like theirs."""
+        self.find_seeds(betas, _SHAPE_FRAMES if betas is None else 0)
+        for index in range(len(self.scans)):
+            self.offer(index, self._found(index, ()))
+        suspicious = is_suspicious(self.misfit)
+        looks = np.stack([_look(self.scan(index)) for index in range(len(self.scans))])
+        for index in np.flatnonzero(suspicious).tolist():
+            apart = np.where(suspicious, np.inf, np.abs(looks - looks[index]).sum(1))
+            for other in np.argsort(apart)[:_ALIKE].tolist():
+                state = self._state(other)
+                moved = replace(state, translation=state.translation + self.scan(index).centre - self.scan(other).centre)
+                self.offer(index, self._fitted(index, moved, _WIDE_M))
 
     def follow_all(self) -> None:
         """Follow the body from the best seed through all frames, and from the others where they are better."""
@@ -213,15 +188,12 @@ class _Tracker:
             self._finds_left -= 1
             scan, state = self.scan(worst), self._state(worst)
             near = [self._state(index) for index in (first - 1, last + 1) if 0 <= index < len(self.scans)]
-            tries = [lambda: self.finder.recover(scan, state, clothes_m=self.clothes_m)]
-            tries.append(lambda: self.finder.find(scan, betas=self.betas, clothes_m=self.clothes_m, near=near))
-            for attempt in tries:
-                if self.offer(worst, attempt().state):
-                    self.follow(worst)
-                    break
+            is_better = self.offer(worst, self.finder.recover(scan, state, clothes_m=self.clothes_m).state)
+            if is_better or self.offer(worst, self._found(worst, near)):
+                self.follow(worst)
         return bool((self.misfit[first : last + 1] < before).any())
 
-    def polished(self, on_frame: Callable[[int], None] | None) -> FittedSequence:
+    def polished(self, on_frame: Callable[[int], None] | None, *, is_ordered: bool = True) -> FittedSequence:
         """Fit all vertices to every frame, and judge the frames."""
         states, agreements = [], []
         for index in range(len(self.scans)):
@@ -232,7 +204,8 @@ class _Tracker:
             if on_frame is not None:
                 on_frame(index)
         residual_m = np.array([one.residual_m for one in agreements])
-        jumps = find_jumps(np.stack([self.surface.joints(state) for state in states]))
+        joints = np.stack([self.surface.joints(state) for state in states])
+        jumps = find_jumps(joints) if is_ordered else np.full(len(states), -1)
         reasons = judge(np.array([one.misfit for one in agreements]), residual_m, jumps, self.surface.joint_names)
         return FittedSequence(
             np.stack([state.pose for state in states]),
@@ -255,6 +228,9 @@ class _Tracker:
             if (other := self._agreement(index, again).misfit) < misfit:
                 return again, other
         return state, misfit
+
+    def _found(self, index: int, near: Sequence[BodyState]) -> BodyState:
+        return self.finder.find(self.scan(index), betas=self.betas, clothes_m=self.clothes_m, near=near).state
 
     def _usual(self) -> float:
         return float(np.median(self.misfit[np.isfinite(self.misfit)]))
@@ -284,6 +260,12 @@ def _continued(before: BodyState, last: BodyState) -> BodyState:
         2 * last.translation - before.translation,
         last.betas,
     )
+
+
+def _look(scan: ScanPoints) -> Array:
+    """Return numbers [24] by which scans can be compared: how the points are spread over height, width and depth, metres."""
+    points = scan.points[:_LOOKS] - scan.centre
+    return np.quantile(points, np.linspace(0, 1, 8), axis=0).reshape(-1)
 
 
 def _stretches(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -73,6 +73,16 @@ def test_frames_without_the_person_are_not_trusted(person):
     assert finder.calls > 3  # the bad frames were searched for, too
 
 
+def test_frames_without_order_are_found_one_by_one(person):
+    starts = [near(state) for state in person.states]
+    starts[5] = wrong(person.states[5])  # its scan is like those of its neighbours
+    finder = NearFinder(starts, surface())
+    fitted = fit_sequence(surface(), person, finder, PRIOR, betas=BETAS, is_ordered=False)
+    assert finder.calls == 12
+    assert person.errors_m(states_of(fitted)).max() < 0.01
+    assert fitted.is_trusted.all()
+
+
 def test_a_body_without_shape_parameters_is_followed(person):
     rigid = replace(
         surface(),

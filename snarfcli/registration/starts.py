@@ -1,19 +1,22 @@
-"""Fit a body to one frame from nowhere: many starts, of which the better half is followed at each stage."""
+"""Fit a body to one frame from nowhere: many starts, of which the better ones are followed at each stage."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface, farthest_points
-from snarfcli.registration.many_poses import kinematics, posed_many
+from snarfcli.registration.joint_limits import random_poses
+from snarfcli.registration.limbs import doubtful_limbs, find_limbs, limb_candidates
+from snarfcli.registration.many_poses import kinematics
+from snarfcli.registration.placing import StartClouds
 from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.rotations import vector_to_matrix
 from snarfcli.registration.scan_grid import ScanGrid
-from snarfcli.registration.scan_points import ScanPoints, with_normals
+from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.solver import Agreement, PosePrior, agreement, fit_state, scales
 
 __all__ = ["Found", "PoseFinder"]
@@ -21,16 +24,32 @@ __all__ = ["Found", "PoseFinder"]
 Array = NDArray[np.float64]
 
 _POSES = 500  # of the library, each as far as possible from those before
-_YAWS = 16
-_TINY, _COARSE = 150, 300  # vertices of the surfaces that score starts and that follow them
-_COARSE_POINTS = 500  # of the scan, for the following
-_SHIFTS = 2  # steps that move a start onto the scan before it is scored
-_CAP_M = 0.3  # a longer distance counts as this one when starts are scored
-_SCORED = 100  # starts whose other side, from the scan to the body, is looked at
-_OTHER_SIDE = 200  # points of the scan for it
-# Each stage: starts at its beginning, steps of each, first and last scale in metres.
-_STAGES = ((32, 5, 0.2, 0.1), (12, 6, 0.12, 0.06), (4, 8, 0.07, 0.04))
-_LAST_STEPS, _LAST_SCALES_M = 10, (0.05, 0.03)  # of the best one, on all vertices
+_TILTED_POSES = 100  # of these, that are also tilted
+_TILTS_DEG = ((60, 0, 0), (110, 0, 0), (-60, 0, 0), (-110, 0, 0), (0, 0, 90), (0, 0, -90))
+_RANDOM_POSES = 1000  # from which those of limbs are taken
+_COARSE, _COARSE_POINTS = 300, 500  # vertices and points of the scan, with which starts are followed
+_LAST_STEPS = 10
+_LAST_SCALES_M = (0.05, 0.03)
+_LIMB_CANDIDATES, _LIMB_STEPS, _LIMB_SCALES_M = 5, 6, (0.12, 0.05)
+_LIMB_ROUNDS = 2
+_BETTER = 0.985  # of the objective before, which a better limb leaves at most
+_TRIED_TO_THE_END = 2  # states whose limbs are looked at
+_ALIKE_RAD = 0.8  # roots turned by less than this against each other are alike
+
+
+@dataclass(frozen=True)
+class _Stage:
+    starts: int
+    alike: int  # at most, of starts whose roots are alike
+    steps: int
+    scales_m: tuple[float, float]
+
+
+_STAGES = (
+    _Stage(40, 3, 5, (0.2, 0.1)),
+    _Stage(14, 3, 6, (0.12, 0.06)),
+    _Stage(5, 2, 8, (0.07, 0.04)),
+)
 
 
 @dataclass(frozen=True)
@@ -39,6 +58,37 @@ class Found:
 
     state: BodyState
     agreement: Agreement
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """A scan, and how a body is fitted to it: coarsely, but judged by all vertices."""
+
+    surface: BodySurface
+    coarse: BodySurface
+    prior: PosePrior
+    scan: ScanPoints
+    shape_is_free: bool
+    clothes_m: float
+
+    def judged(self, state: BodyState) -> Found:
+        """Return the state with its agreement."""
+        return Found(state, agreement(self.surface, state, self.scan))
+
+    def followed(self, state: BodyState, steps: int, scales_m: tuple[float, float]) -> Found:
+        """Return the state after some steps of a few vertices."""
+        few = ScanPoints(self.scan.points[:_COARSE_POINTS], self.scan.normals[:_COARSE_POINTS])
+        return self.judged(self._fit(self.coarse, few, state, steps, scales_m))
+
+    def finished(self, state: BodyState) -> Found:
+        """Return the state after the last steps, of all vertices."""
+        return self.judged(self._fit(self.surface, self.scan, state, _LAST_STEPS, _LAST_SCALES_M))
+
+    def _fit(
+        self, surface: BodySurface, scan: ScanPoints, state: BodyState, steps: int, scales_m: tuple[float, float]
+    ) -> BodyState:
+        along = scales(*scales_m, steps)
+        return fit_state(surface, state, scan, along, self.prior, shape_is_free=self.shape_is_free, clothes_m=self.clothes_m)
 
 
 class PoseFinder:
@@ -54,11 +104,12 @@ class PoseFinder:
         """
         self.surface, self.prior = surface, prior
         self._coarse = surface.take(farthest_points(surface.points_rest, _COARSE))
-        self._tiny = surface.take(farthest_points(surface.points_rest, _TINY))
         rotations = vector_to_matrix(library.poses)
         _, joints = kinematics(surface.parents, surface.joints_rest, rotations)
-        self._rotations = rotations[farthest_points(joints.reshape(len(joints), -1), _POSES)]
-        self._clouds = posed_many(self._tiny, self._rotations, np.zeros(surface.num_betas))
+        spread = rotations[farthest_points(joints.reshape(len(joints), -1), _POSES)]
+        self._starts = StartClouds(surface, np.concatenate([spread, _tilted(spread[:_TILTED_POSES])]))
+        by_chance = random_poses(surface.joint_names, _RANDOM_POSES)
+        self._limbs = find_limbs(self._coarse, rotations, None if by_chance is None else vector_to_matrix(by_chance))
 
     def find(
         self, scan: ScanPoints, *, betas: Array | None = None, clothes_m: float = 0.0, near: Sequence[BodyState] = ()
@@ -71,79 +122,68 @@ class PoseFinder:
             clothes_m: the body may be so far below the surface without cost, metres.
             near: further starts, such as the states of frames close in time.
         """
-        shape = np.zeros(self.surface.num_betas) if betas is None else betas
-        free = betas is None and self.surface.num_betas > 0
-        states = self._starts(scan, shape)
-        coarse = ScanPoints(scan.points[:_COARSE_POINTS], scan.normals[:_COARSE_POINTS])
-        for stage, (count, steps, first, last) in enumerate(_STAGES):
-            states = [*near, *states[:count]] if stage == 1 else states[:count]
-            followed = (
-                fit_state(
-                    self._coarse, state, coarse, scales(first, last, steps), self.prior, shape_is_free=free, clothes_m=clothes_m
-                )
-                for state in states
-            )
-            states = _best_first(self._coarse, followed, coarse)
-        state = fit_state(
-            self.surface,
-            states[0],
-            scan,
-            scales(*_LAST_SCALES_M, _LAST_STEPS),
-            self.prior,
-            shape_is_free=free,
-            clothes_m=clothes_m,
-        )
-        return Found(state, agreement(self.surface, state, scan))
-
-    def _starts(self, scan: ScanPoints, betas: Array) -> list[BodyState]:
-        """Return poses of the library, turned about y and placed on the scan, the best first."""
         grid = ScanGrid(scan)
-        yaws = 2 * np.pi * np.arange(_YAWS) / _YAWS
-        turns = vector_to_matrix(np.stack([np.zeros(_YAWS), yaws, np.zeros(_YAWS)], 1))
-        placed = [_placed(self._clouds, turn, grid) for turn in turns]
-        cost = np.stack([each[0] for each in placed])  # [yaws, poses]
-        is_best = (cost <= np.roll(cost, 1, 0)) & (cost <= np.roll(cost, -1, 0))  # among neighbouring yaws
-        order = np.argsort(np.where(is_best, cost, np.inf), axis=None)[:_SCORED]
-        chosen = [np.unravel_index(number, cost.shape) for number in order]
-        other = with_normals(scan.points[:_OTHER_SIDE], scan.normals[:_OTHER_SIDE])
-        both = []
-        for yaw, pose in chosen:
-            points, normals = (cloud[pose] @ turns[yaw].T for cloud in self._clouds)
-            body = with_normals(points + placed[yaw][1][pose], normals)
-            both.append(cost[yaw, pose] + np.minimum(_distances(other, body).min(1), _CAP_M).mean())
-        root = self.surface.joints_rest[0]
-        states = []
-        for number in np.argsort(both):
-            yaw, pose = chosen[number]
-            rotations = self._rotations[pose].copy()
-            rotations[0] = turns[yaw] @ rotations[0]
-            # the clouds are turned about the origin, a state about its root
-            states.append(BodyState(rotations, placed[yaw][1][pose] + turns[yaw] @ root - root, betas))
-        return states
+        frame = self._frame(scan, betas is None, clothes_m)
+        states = self._starts.placed(grid, np.zeros(self.surface.num_betas) if betas is None else betas)
+        for number, stage in enumerate(_STAGES):
+            states = _unlike(states, stage.starts, stage.alike) + ([*near] if number == 1 else [])
+            followed = [frame.followed(state, stage.steps, stage.scales_m) for state in states]
+            states = [each.state for each in sorted(followed, key=_objective)]
+        tried = []
+        for state in _unlike(states, _TRIED_TO_THE_END, 1):
+            tried.append(self._with_better_limbs(frame.judged(state), frame, grid))
+            if not doubtful_limbs(self.surface, self._limbs, tried[-1].agreement):
+                break
+        return frame.finished(min(tried, key=_objective).state)
+
+    def recover(self, scan: ScanPoints, state: BodyState, *, clothes_m: float = 0.0) -> Found:
+        """Fit one frame from a state whose single limbs may be wrong; the shape stays.
+
+        Args:
+            scan: the points, in random order.
+            state: to start from.
+            clothes_m: the body may be so far below the surface without cost, metres.
+        """
+        frame = self._frame(scan, False, clothes_m)
+        return frame.finished(self._with_better_limbs(frame.judged(state), frame, ScanGrid(scan)).state)
+
+    def _frame(self, scan: ScanPoints, shape_is_free: bool, clothes_m: float) -> _Frame:
+        return _Frame(self.surface, self._coarse, self.prior, scan, shape_is_free and self.surface.num_betas > 0, clothes_m)
+
+    def _with_better_limbs(self, found: Found, frame: _Frame, grid: ScanGrid) -> Found:
+        """Try other poses of each doubtful limb."""
+        for _ in range(_LIMB_ROUNDS):
+            before = found
+            for limb in self._limbs:
+                if limb in doubtful_limbs(self.surface, self._limbs, found.agreement):
+                    candidates = limb_candidates(self._coarse, found.state, limb, grid, _LIMB_CANDIDATES)
+                    followed = [frame.followed(state, _LIMB_STEPS, _LIMB_SCALES_M) for state in candidates]
+                    best = min(followed, key=_objective)
+                    found = best if _objective(best) < _BETTER * _objective(found) else found
+            if found is before:
+                break
+        return found
 
 
-def _placed(clouds: tuple[Array, Array], turn: Array, grid: ScanGrid) -> tuple[Array, Array]:
-    """Turn clouds [C, K, 3] about y and move them onto the scan; return their costs [C] and shifts [C, 3], metres."""
-    points, normals = (cloud @ turn.T for cloud in clouds)
-    shift = grid.scan.centre - (points.max(1) + points.min(1)) / 2
-    for _ in range(_SHIFTS):
-        moved = points + shift[:, None]
-        away = grid.scan.points[grid.closest(moved)] - moved
-        length = np.linalg.norm(away, axis=2, keepdims=True)
-        shift = shift + (away * np.minimum(1.0, _CAP_M / np.maximum(length, _CAP_M))).mean(1)
-    moved = points + shift[:, None]
-    closest = grid.closest(moved)
-    apart = with_normals(
-        (grid.scan.points[closest] - moved).reshape(-1, 3), (grid.scan.normals[closest] - normals).reshape(-1, 3)
-    )
-    return np.minimum(np.linalg.norm(apart, axis=1), _CAP_M).reshape(len(points), -1).mean(1), shift
+def _objective(found: Found) -> float:
+    return found.agreement.objective
 
 
-def _distances(one: Array, other: Array) -> Array:
-    """Return the distances [N, M] between points [N, D] and [M, D]."""
-    squared = np.square(one).sum(1)[:, None] + np.square(other).sum(1) - 2 * one @ other.T
-    return np.sqrt(np.maximum(squared, 0.0))
+def _tilted(rotations: Array) -> Array:
+    """Return poses [C, J, 3, 3] tilted forwards, backwards and to the sides, as of bodies that bend or lie."""
+    tilts = vector_to_matrix(np.radians(_TILTS_DEG))
+    tilted = np.tile(rotations, (len(tilts), 1, 1, 1))
+    tilted[:, 0] = np.repeat(tilts, len(rotations), 0) @ tilted[:, 0]
+    return tilted
 
 
-def _best_first(surface: BodySurface, states: Iterable[BodyState], scan: ScanPoints) -> list[BodyState]:
-    return sorted(states, key=lambda state: agreement(surface, state, scan).objective)
+def _unlike(states: Sequence[BodyState], count: int, alike: int) -> list[BodyState]:
+    """Return the first `count` of some states without more than `alike` whose roots are turned alike."""
+    chosen: list[BodyState] = []
+    for state in states:
+        cosines = [(np.trace(other.rotations[0].T @ state.rotations[0]) - 1) / 2 for other in chosen]
+        if sum(cosine > np.cos(_ALIKE_RAD) for cosine in cosines) < alike:
+            chosen.append(state)
+        if len(chosen) == count:
+            break
+    return chosen

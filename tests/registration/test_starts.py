@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from body_scans import body_scan
@@ -53,7 +55,8 @@ def test_a_given_shape_is_kept(finder):
 
 
 def test_a_state_nearby_helps_where_the_library_does_not(finder):
-    finder = PoseFinder(finder.surface, PoseLibrary.of_rig(24), PosePrior.weak(24))
+    unknown = replace(finder.surface, joint_names=tuple(f"joint_{number}" for number in range(24)))
+    finder = PoseFinder(unknown, PoseLibrary.of_rig(24), PosePrior.weak(24))
     truth = turned_frame("bridges", 7.0, 0.5)
     near = BodyState.from_pose(truth.pose + 0.05, truth.translation + 0.02, truth.betas)
     scan = body_scan(truth)
@@ -68,3 +71,14 @@ def test_noise_and_an_unseen_side_do_not_break_it(finder):
     noise = np.random.default_rng(0).normal(0, 0.005, scan.points.shape)
     part = ScanPoints((scan.points + noise)[seen], scan.normals[seen])
     assert errors_m(finder, finder.find(part).state, truth).mean() < 0.030
+
+
+def test_a_wrong_arm_is_found_again(finder):
+    truth = turned_frame("jumping_jacks", 1.0, 0.7)
+    pose = truth.pose
+    pose[16], pose[18] = 0.0, (0.0, -2.0, 0.0)  # left shoulder and elbow
+    lost = BodyState.from_pose(pose, truth.translation, truth.betas)
+    found = finder.recover(body_scan(truth), lost)
+    assert errors_m(finder, lost, truth).max() > 0.2
+    assert errors_m(finder, found.state, truth).mean() < 0.010
+    np.testing.assert_array_equal(found.state.betas, truth.betas)

@@ -25,9 +25,10 @@ _SCAN_POINTS = 500  # of the scan, that limbs are scored with
 _ROBUST_M = 0.08  # distance that counts half of the most, when limbs are scored
 _EXPLAINED_M = 0.03  # a point this close to the rest of the body does not need the limb
 _APART_M = 0.08  # mean distance between the vertices of candidates that differ
-_FAR_M = 0.05  # a vertex or a point of the scan this far from its match has none
+_BETTER = 1.0  # of the cost of the pose that a limb has, which another one costs at most before it is followed
+_FAR_M = 0.06  # a vertex or a point of the scan this far from its match has none
 _MOST_FAR = 0.1  # share of a limb's vertices
-_MOST_OPEN = 0.02  # share of the points of the scan
+_MOST_OPEN = 0.015  # share of the points of the scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ def doubtful_limbs(surface: BodySurface, limbs: Sequence[Limb], found: Agreement
 
 
 def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: ScanGrid, count: int) -> list[BodyState]:
-    """Return states in which a limb takes other poses that explain the scan, the best first, each unlike those before.
+    """Return states in which a limb takes other poses that explain the scan better, the best first, each unlike those before.
 
     Args:
         surface: the body that the limb is of.
@@ -88,7 +89,8 @@ def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: Sc
         count: the most states.
     """
     posed = surface.posed(state)
-    points, normals = _posed_limb(surface, state, posed, limb)
+    rotations = np.concatenate([limb.rotations, state.rotations[None, limb.joints]])
+    points, normals = _posed_limb(surface, state, posed, limb, rotations)
     closest = grid.closest(points)
     scan = grid.scan
     cost = _robust(np.square(scan.points[closest] - points).sum(2) + _normals_apart(scan.normals[closest], normals)).sum(1)
@@ -104,10 +106,10 @@ def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: Sc
         cost += _robust(np.minimum(of_limb, of_rest[is_open, None])).sum(0) / len(wanted)
     chosen: list[int] = []
     for number in np.argsort(cost):
+        if len(chosen) == count or cost[number] >= _BETTER * cost[-1]:
+            break
         if all(np.linalg.norm(points[number] - points[other], axis=1).mean() > _APART_M for other in chosen):
             chosen.append(int(number))
-        if len(chosen) == count:
-            break
     return [_with_limb(state, limb, number) for number in chosen]
 
 
@@ -144,15 +146,17 @@ def _spread(surface: BodySurface, joints: NDArray[np.intp], poses: Array) -> Arr
     return poses[farthest_points(seen.reshape(len(poses), -1), _POSES)][:, joints]
 
 
-def _posed_limb(surface: BodySurface, state: BodyState, posed: PosedSurface, limb: Limb) -> tuple[Array, Array]:
+def _posed_limb(
+    surface: BodySurface, state: BodyState, posed: PosedSurface, limb: Limb, rotations: Array
+) -> tuple[Array, Array]:
     """Return points and normals [C, vertices, 3] of the limb's vertices in its poses, without pose correctives."""
     rest = surface.rest_joints(state.betas)
     turns, places = dict(enumerate(posed.turns)), dict(enumerate(posed.joints))
     for number, joint in enumerate(limb.joints):
         parent = surface.parents[joint]
-        turns[joint] = turns[parent] @ limb.rotations[:, number]
+        turns[joint] = turns[parent] @ rotations[:, number]
         places[joint] = places[parent] + turns[parent] @ (rest[joint] - rest[parent])
-    count = len(limb.rotations)
+    count = len(rotations)
     few = surface.take(limb.vertices[:_SCORED_VERTICES])
     all_turns = np.stack([np.broadcast_to(turns[joint], (count, 3, 3)) for joint in range(surface.num_joints)], 1)
     all_places = np.stack([np.broadcast_to(places[joint], (count, 3)) for joint in range(surface.num_joints)], 1)

@@ -158,7 +158,7 @@ class PoseFinder:
                 if limb in doubtful_limbs(self.surface, self._limbs, found.agreement):
                     candidates = limb_candidates(self._coarse, found.state, limb, grid, _LIMB_CANDIDATES)
                     followed = [frame.followed(state, _LIMB_STEPS, _LIMB_SCALES_M) for state in candidates]
-                    best = min(followed, key=_objective)
+                    best = min(followed, key=_objective, default=found)
                     found = best if _objective(best) < _BETTER * _objective(found) else found
             if found is before:
                 break

@@ -12,12 +12,14 @@ from snarfcli.motions import OUT_OF_DISTRIBUTION_SEQUENCES, TRAINING_SEQUENCES, 
 from snarfcli.motions.layouts import SMPL, carry_over
 from snarfcli.motions.plain_names import plain_name
 from snarfcli.registration.rotations import matrix_to_vector, vector_to_matrix
+from snarfcli.registration.solver import PosePrior
 
 __all__ = ["PoseLibrary"]
 
 Array = NDArray[np.float64]
 
 _SEEDS = (1, 2)
+_FEW = 100  # poses, fewer of which do not tell what is usual
 _FRAME_RATE = 8.0  # per second; consecutive poses are then about as far apart as poses of different seeds
 
 
@@ -46,6 +48,10 @@ class PoseLibrary:
         """Return the rest pose and the poses [L, J, 3] of a rig's own clips, axis-angle, radians."""
         rest = np.zeros((1, joints, 3))
         return cls(facing_forwards(rest if poses is None else np.concatenate([rest, poses])))
+
+    def prior(self) -> PosePrior:
+        """Return the prior by which poses unlike those of the library cost more; a weak one if the library has few."""
+        return PosePrior.of_poses(self.poses) if len(self.poses) >= _FEW else PosePrior.weak(self.poses.shape[1])
 
 
 def facing_forwards(poses: Array) -> Array:

@@ -9,6 +9,7 @@ from snarfcli.motions import TRAINING_SEQUENCES
 from snarfcli.motions.layouts import SMPL_X
 from snarfcli.registration.pose_library import PoseLibrary, facing_forwards
 from snarfcli.registration.rotations import matrix_to_vector, vector_to_matrix
+from snarfcli.registration.solver import PosePrior
 
 
 def test_all_poses_face_forwards():
@@ -49,3 +50,18 @@ def test_a_rig_brings_its_own_poses():
     library = PoseLibrary.of_rig(5, own)
     assert library.poses.shape == (5, 5, 3)
     np.testing.assert_array_equal(library.poses[1:, 1:], own[:, 1:])
+
+
+def test_the_prior_of_the_built_in_motions_keeps_knees_from_bending_to_the_side():
+    prior = PoseLibrary.builtin(SMPL_JOINT_NAMES).prior()
+    knee, shoulder = SMPL_JOINT_NAMES.index("l_knee"), SMPL_JOINT_NAMES.index("l_shoulder")
+    assert prior.weight[knee, 2] > 5 * prior.weight[knee, 0]
+    assert prior.weight[knee, 2] > 5 * prior.weight[shoulder].max()
+    assert prior.mean[knee, 0] > 0.3  # bent
+
+
+def test_joints_that_never_move_and_small_libraries_have_a_weak_prior():
+    weak = PosePrior.weak(55)
+    fingers = PoseLibrary.builtin(SMPL_X).prior()
+    np.testing.assert_array_equal(fingers.weight[25:], weak.weight[25:])
+    np.testing.assert_array_equal(PoseLibrary.of_rig(55).prior().weight, weak.weight)

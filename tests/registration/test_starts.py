@@ -25,7 +25,7 @@ def finder() -> PoseFinder:
     body = builtin_body()
     surface = BodySurface.from_body(body, 600)
     library = PoseLibrary.builtin(body.joint_names, leave_out={"deep_squats", "jumping_jacks"})
-    return PoseFinder(surface, library, PosePrior.weak(24))
+    return PoseFinder(surface, library, library.prior())
 
 
 def turned_frame(motion: str, time_s: float, yaw: float) -> BodyState:

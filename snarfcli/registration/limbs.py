@@ -25,7 +25,6 @@ _SCAN_POINTS = 500  # of the scan, that limbs are scored with
 _ROBUST_M = 0.08  # distance that counts half of the most, when limbs are scored
 _EXPLAINED_M = 0.03  # a point this close to the rest of the body does not need the limb
 _APART_M = 0.08  # mean distance between the vertices of candidates that differ
-_BETTER = 1.0  # of the cost of the pose that a limb has, which another one costs at most before it is followed
 _FAR_M = 0.06  # a vertex or a point of the scan this far from its match has none
 _MOST_FAR = 0.1  # share of a limb's vertices
 _MOST_OPEN = 0.015  # share of the points of the scan
@@ -78,7 +77,9 @@ def doubtful_limbs(surface: BodySurface, limbs: Sequence[Limb], found: Agreement
     return [limb for limb in limbs if is_far[surface.shares[:, limb.joints[0]] > 0.5].mean() > _MOST_FAR]
 
 
-def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: ScanGrid, count: int) -> list[BodyState]:
+def limb_candidates(
+    surface: BodySurface, state: BodyState, limb: Limb, grid: ScanGrid, count: int, most_cost: float = 1.0
+) -> list[BodyState]:
     """Return states in which a limb takes other poses that explain the scan better, the best first, each unlike those before.
 
     Args:
@@ -87,6 +88,7 @@ def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: Sc
         limb: the limb.
         grid: of the scan.
         count: the most states.
+        most_cost: of a pose, relative to the cost of the pose that the limb has.
     """
     posed = surface.posed(state)
     rotations = np.concatenate([limb.rotations, state.rotations[None, limb.joints]])
@@ -105,8 +107,8 @@ def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: Sc
         of_limb = squared_distances(wanted[is_open], body).reshape(is_open.sum(), *points.shape[:2]).min(2)
         cost += _robust(np.minimum(of_limb, of_rest[is_open, None])).sum(0) / len(wanted)
     chosen: list[int] = []
-    for number in np.argsort(cost):
-        if len(chosen) == count or cost[number] >= _BETTER * cost[-1]:
+    for number in np.argsort(cost[:-1]):
+        if len(chosen) == count or cost[number] >= most_cost * cost[-1]:
             break
         if all(np.linalg.norm(points[number] - points[other], axis=1).mean() > _APART_M for other in chosen):
             chosen.append(int(number))

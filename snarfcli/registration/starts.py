@@ -31,7 +31,7 @@ _COARSE, _COARSE_POINTS = 300, 500  # vertices and points of the scan, with whic
 _LAST_STEPS = 10
 _LAST_SCALES_M = (0.05, 0.03)
 _LIMB_CANDIDATES, _LIMB_STEPS, _LIMB_SCALES_M = 5, 6, (0.12, 0.05)
-_LIMB_ROUNDS = 2
+_LIMB_ROUNDS = (1.0, 1.0, 2.0)  # the most cost of a limb's poses that are followed, relative to the pose that it has
 _BETTER = 0.985  # of the objective before, which a better limb leaves at most
 _TRIED_TO_THE_END = 2  # states whose limbs are looked at
 _ALIKE_RAD = 0.8  # roots turned by less than this against each other are alike
@@ -152,16 +152,13 @@ class PoseFinder:
 
     def _with_better_limbs(self, found: Found, frame: _Frame, grid: ScanGrid) -> Found:
         """Try other poses of each doubtful limb."""
-        for _ in range(_LIMB_ROUNDS):
-            before = found
+        for most_cost in _LIMB_ROUNDS:
             for limb in self._limbs:
                 if limb in doubtful_limbs(self.surface, self._limbs, found.agreement):
-                    candidates = limb_candidates(self._coarse, found.state, limb, grid, _LIMB_CANDIDATES)
+                    candidates = limb_candidates(self._coarse, found.state, limb, grid, _LIMB_CANDIDATES, most_cost)
                     followed = [frame.followed(state, _LIMB_STEPS, _LIMB_SCALES_M) for state in candidates]
                     best = min(followed, key=_objective, default=found)
                     found = best if _objective(best) < _BETTER * _objective(found) else found
-            if found is before:
-                break
         return found
 
 

@@ -51,21 +51,20 @@ def find_limbs(surface: BodySurface, library: Array, by_chance: Array | None) ->
         by_chance: [L, J, 3, 3], poses inside the limits of the joints, for limbs without branches.
     """
     children = [
-        [child for child, parent in enumerate(surface.parents) if parent == joint] for joint in range(surface.num_joints)
+        [child for child in _children(surface, joint) if _is_large(surface, child)] for joint in range(surface.num_joints)
     ]
     whole, halves = [], []
-    for first, parent in enumerate(surface.parents):
-        if parent < 0 or len(children[parent]) < 2 or not _is_large(surface, first):
-            continue
-        joints = np.flatnonzero(surface.follows[:, first])
-        if all(len(children[joint]) < 2 for joint in joints):
+    for parent in range(surface.num_joints):
+        for first in children[parent] if len(children[parent]) > 1 else ():
+            joints = np.flatnonzero(surface.follows[:, first])
+            if any(len(children[joint]) > 1 for joint in joints):
+                whole.append(_limb(surface, first, library))
+                continue
             poses = library if by_chance is None else np.concatenate([library, by_chance])
-            middle = _middle(surface, joints)
-            whole.append(_limb(surface, joints, poses))
-            if middle > 0 and _is_large(surface, joints[middle]):
-                halves.append(_limb(surface, joints[middle:], poses))
-        else:
-            whole.append(_limb(surface, joints, library))
+            whole.append(_limb(surface, first, poses))
+            middle = _middle(surface, first)
+            if middle != first and _is_large(surface, middle):
+                halves.append(_limb(surface, middle, poses))
     return whole + halves
 
 
@@ -126,18 +125,26 @@ def _with_limb(state: BodyState, limb: Limb, number: int) -> BodyState:
     return replace(state, rotations=rotations)
 
 
-def _limb(surface: BodySurface, joints: NDArray[np.intp], poses: Array) -> Limb:
-    return Limb(joints, np.flatnonzero(surface.shares[:, joints[0]] > 0.5), _spread(surface, joints, poses))
+def _limb(surface: BodySurface, first: int, poses: Array) -> Limb:
+    joints = np.flatnonzero(surface.follows[:, first])
+    return Limb(joints, np.flatnonzero(surface.shares[:, first] > 0.5), _spread(surface, joints, poses))
+
+
+def _children(surface: BodySurface, joint: int) -> list[int]:
+    return [child for child, parent in enumerate(surface.parents) if parent == joint]
 
 
 def _is_large(surface: BodySurface, joint: int) -> bool:
     return bool((surface.shares[:, joint] > 0.5).mean() >= _LEAST_SHARE)
 
 
-def _middle(surface: BodySurface, joints: NDArray[np.intp]) -> int:
-    """Return the place in a chain of joints that is closest to half of its length."""
-    along = np.append(0.0, np.linalg.norm(np.diff(surface.joints_rest[joints], axis=0), axis=1).cumsum())
-    return int(np.abs(along - along[-1] / 2).argmin())
+def _middle(surface: BodySurface, first: int) -> int:
+    """Return the joint that is closest to half of the way from a joint to the end of its limb, such as an elbow."""
+    chain = [first]
+    while children := _children(surface, chain[-1]):
+        chain.append(max(children, key=lambda child: surface.shares[:, child].sum()))
+    along = np.append(0.0, np.linalg.norm(np.diff(surface.joints_rest[chain], axis=0), axis=1).cumsum())
+    return chain[int(np.abs(along - along[-1] / 2).argmin())]
 
 
 def _spread(surface: BodySurface, joints: NDArray[np.intp], poses: Array) -> Array:

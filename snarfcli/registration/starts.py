@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,6 +122,8 @@ class PoseFinder:
             clothes_m: the body may be so far below the surface without cost, metres.
             near: further starts, such as the states of frames close in time.
         """
+        if betas is not None:
+            near = [replace(state, betas=betas) for state in near]
         grid = ScanGrid(scan)
         frame = self._frame(scan, betas is None, clothes_m)
         states = self._starts.placed(grid, np.zeros(self.surface.num_betas) if betas is None else betas)

@@ -25,7 +25,6 @@ _SCAN_POINTS = 500  # of the scan, that limbs are scored with
 _ROBUST_M = 0.08  # distance that counts half of the most, when limbs are scored
 _EXPLAINED_M = 0.03  # a point this close to the rest of the body does not need the limb
 _APART_M = 0.08  # mean distance between the vertices of candidates that differ
-_BETTER = 1.0  # of the cost of the pose that a limb has, which another one costs at most before it is followed
 _FAR_M = 0.06  # a vertex or a point of the scan this far from its match has none
 _MOST_FAR = 0.1  # share of a limb's vertices
 _MOST_OPEN = 0.015  # share of the points of the scan
@@ -52,21 +51,20 @@ def find_limbs(surface: BodySurface, library: Array, by_chance: Array | None) ->
         by_chance: [L, J, 3, 3], poses inside the limits of the joints, for limbs without branches.
     """
     children = [
-        [child for child, parent in enumerate(surface.parents) if parent == joint] for joint in range(surface.num_joints)
+        [child for child in _children(surface, joint) if _is_large(surface, child)] for joint in range(surface.num_joints)
     ]
     whole, halves = [], []
-    for first, parent in enumerate(surface.parents):
-        if parent < 0 or len(children[parent]) < 2 or not _is_large(surface, first):
-            continue
-        joints = np.flatnonzero(surface.follows[:, first])
-        if all(len(children[joint]) < 2 for joint in joints):
+    for parent in range(surface.num_joints):
+        for first in children[parent] if len(children[parent]) > 1 else ():
+            joints = np.flatnonzero(surface.follows[:, first])
+            if any(len(children[joint]) > 1 for joint in joints):
+                whole.append(_limb(surface, first, library))
+                continue
             poses = library if by_chance is None else np.concatenate([library, by_chance])
-            middle = _middle(surface, joints)
-            whole.append(_limb(surface, joints, poses))
-            if middle > 0 and _is_large(surface, joints[middle]):
-                halves.append(_limb(surface, joints[middle:], poses))
-        else:
-            whole.append(_limb(surface, joints, library))
+            whole.append(_limb(surface, first, poses))
+            middle = _middle(surface, first)
+            if middle != first and _is_large(surface, middle):
+                halves.append(_limb(surface, middle, poses))
     return whole + halves
 
 
@@ -78,7 +76,9 @@ def doubtful_limbs(surface: BodySurface, limbs: Sequence[Limb], found: Agreement
     return [limb for limb in limbs if is_far[surface.shares[:, limb.joints[0]] > 0.5].mean() > _MOST_FAR]
 
 
-def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: ScanGrid, count: int) -> list[BodyState]:
+def limb_candidates(
+    surface: BodySurface, state: BodyState, limb: Limb, grid: ScanGrid, count: int, most_cost: float = 1.0
+) -> list[BodyState]:
     """Return states in which a limb takes other poses that explain the scan better, the best first, each unlike those before.
 
     Args:
@@ -87,6 +87,7 @@ def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: Sc
         limb: the limb.
         grid: of the scan.
         count: the most states.
+        most_cost: of a pose, relative to the cost of the pose that the limb has.
     """
     posed = surface.posed(state)
     rotations = np.concatenate([limb.rotations, state.rotations[None, limb.joints]])
@@ -105,8 +106,8 @@ def limb_candidates(surface: BodySurface, state: BodyState, limb: Limb, grid: Sc
         of_limb = squared_distances(wanted[is_open], body).reshape(is_open.sum(), *points.shape[:2]).min(2)
         cost += _robust(np.minimum(of_limb, of_rest[is_open, None])).sum(0) / len(wanted)
     chosen: list[int] = []
-    for number in np.argsort(cost):
-        if len(chosen) == count or cost[number] >= _BETTER * cost[-1]:
+    for number in np.argsort(cost[:-1]):
+        if len(chosen) == count or cost[number] >= most_cost * cost[-1]:
             break
         if all(np.linalg.norm(points[number] - points[other], axis=1).mean() > _APART_M for other in chosen):
             chosen.append(int(number))
@@ -124,18 +125,26 @@ def _with_limb(state: BodyState, limb: Limb, number: int) -> BodyState:
     return replace(state, rotations=rotations)
 
 
-def _limb(surface: BodySurface, joints: NDArray[np.intp], poses: Array) -> Limb:
-    return Limb(joints, np.flatnonzero(surface.shares[:, joints[0]] > 0.5), _spread(surface, joints, poses))
+def _limb(surface: BodySurface, first: int, poses: Array) -> Limb:
+    joints = np.flatnonzero(surface.follows[:, first])
+    return Limb(joints, np.flatnonzero(surface.shares[:, first] > 0.5), _spread(surface, joints, poses))
+
+
+def _children(surface: BodySurface, joint: int) -> list[int]:
+    return [child for child, parent in enumerate(surface.parents) if parent == joint]
 
 
 def _is_large(surface: BodySurface, joint: int) -> bool:
     return bool((surface.shares[:, joint] > 0.5).mean() >= _LEAST_SHARE)
 
 
-def _middle(surface: BodySurface, joints: NDArray[np.intp]) -> int:
-    """Return the place in a chain of joints that is closest to half of its length."""
-    along = np.append(0.0, np.linalg.norm(np.diff(surface.joints_rest[joints], axis=0), axis=1).cumsum())
-    return int(np.abs(along - along[-1] / 2).argmin())
+def _middle(surface: BodySurface, first: int) -> int:
+    """Return the joint that is closest to half of the way from a joint to the end of its limb, such as an elbow."""
+    chain = [first]
+    while children := _children(surface, chain[-1]):
+        chain.append(max(children, key=lambda child: surface.shares[:, child].sum()))
+    along = np.append(0.0, np.linalg.norm(np.diff(surface.joints_rest[chain], axis=0), axis=1).cumsum())
+    return chain[int(np.abs(along - along[-1] / 2).argmin())]
 
 
 def _spread(surface: BodySurface, joints: NDArray[np.intp], poses: Array) -> Array:

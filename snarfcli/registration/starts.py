@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ _COARSE, _COARSE_POINTS = 300, 500  # vertices and points of the scan, with whic
 _LAST_STEPS = 10
 _LAST_SCALES_M = (0.05, 0.03)
 _LIMB_CANDIDATES, _LIMB_STEPS, _LIMB_SCALES_M = 5, 6, (0.12, 0.05)
-_LIMB_ROUNDS = 2
+_LIMB_ROUNDS = (1.0, 1.0, 2.0)  # the most cost of a limb's poses that are followed, relative to the pose that it has
 _BETTER = 0.985  # of the objective before, which a better limb leaves at most
 _TRIED_TO_THE_END = 2  # states whose limbs are looked at
 _ALIKE_RAD = 0.8  # roots turned by less than this against each other are alike
@@ -122,6 +122,8 @@ class PoseFinder:
             clothes_m: the body may be so far below the surface without cost, metres.
             near: further starts, such as the states of frames close in time.
         """
+        if betas is not None:
+            near = [replace(state, betas=betas) for state in near]
         grid = ScanGrid(scan)
         frame = self._frame(scan, betas is None, clothes_m)
         states = self._starts.placed(grid, np.zeros(self.surface.num_betas) if betas is None else betas)
@@ -152,16 +154,13 @@ class PoseFinder:
 
     def _with_better_limbs(self, found: Found, frame: _Frame, grid: ScanGrid) -> Found:
         """Try other poses of each doubtful limb."""
-        for _ in range(_LIMB_ROUNDS):
-            before = found
+        for most_cost in _LIMB_ROUNDS:
             for limb in self._limbs:
                 if limb in doubtful_limbs(self.surface, self._limbs, found.agreement):
-                    candidates = limb_candidates(self._coarse, found.state, limb, grid, _LIMB_CANDIDATES)
+                    candidates = limb_candidates(self._coarse, found.state, limb, grid, _LIMB_CANDIDATES, most_cost)
                     followed = [frame.followed(state, _LIMB_STEPS, _LIMB_SCALES_M) for state in candidates]
                     best = min(followed, key=_objective, default=found)
                     found = best if _objective(best) < _BETTER * _objective(found) else found
-            if found is before:
-                break
         return found
 
 

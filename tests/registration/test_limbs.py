@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from body_scans import body_scan
@@ -58,6 +60,24 @@ def test_a_person_has_arms_legs_a_head_and_an_upper_body_and_halves_of_limbs(lim
     assert set(found) == {"l_hip", "r_hip", "spine1", "neck", "l_collar", "r_collar", "l_knee", "r_knee", "l_elbow", "r_elbow"}
     assert [SMPL_JOINT_NAMES[joint] for joint in found["l_elbow"].joints] == ["l_elbow", "l_wrist", "l_hand"]
     assert found["r_hip"].rotations.shape == (250, 4, 3, 3)
+
+
+def test_fingers_do_not_hide_an_arm(surface):
+    wrist = NUMBER["l_wrist"]
+    fingers = replace(
+        surface,
+        joint_names=(*surface.joint_names, "l_index1", "l_ring1"),
+        parents=(*surface.parents, wrist, wrist),
+        joints_rest=np.concatenate([surface.joints_rest, surface.joints_rest[[wrist, wrist]] + 0.03]),
+        joints_by_beta=np.concatenate([surface.joints_by_beta, surface.joints_by_beta[[wrist, wrist]]]),
+        weights=np.concatenate([surface.weights, np.zeros((len(surface.weights), 2))], 1),
+    )
+    poses = np.tile(np.eye(3), (2, 26, 1, 1))
+    found = {fingers.joint_names[limb.joints[0]]: limb for limb in find_limbs(fingers, poses, poses)}
+    assert [fingers.joint_names[joint] for joint in found["l_elbow"].joints] == [
+        "l_elbow", "l_wrist", "l_hand", "l_index1", "l_ring1",
+    ]  # fmt: skip
+    assert "l_index1" not in found
 
 
 def test_a_chain_has_no_limbs(surface):

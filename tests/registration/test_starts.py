@@ -49,7 +49,8 @@ def test_a_frame_of_an_unknown_motion_is_found_without_its_shape(finder, motion,
 
 def test_a_given_shape_is_kept(finder):
     truth = turned_frame("punching", 1.0, 1.0)
-    found = finder.find(body_scan(truth), betas=BETAS)
+    near = BodyState(truth.rotations, truth.translation, np.zeros(10))
+    found = finder.find(body_scan(truth), betas=BETAS, near=[near])
     np.testing.assert_array_equal(found.state.betas, BETAS)
     assert errors_m(finder, found.state, truth).mean() < 0.010
 

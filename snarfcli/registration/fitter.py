@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from snarfcli.bodies import Body, Skeleton, builtin_body, find_body, load_body
 from snarfcli.registration.body_surface import BodyState, BodySurface
 from snarfcli.registration.pose_library import PoseLibrary
+from snarfcli.registration.rigs import RigSurface, read_rig
+from snarfcli.registration.solver import PosePrior
 from snarfcli.registration.starts import PoseFinder
 
 __all__ = ["BodyChoice", "Fitter", "RigFitter", "load_fitter"]
@@ -52,20 +54,15 @@ class Fitter(ABC):
     library: PoseLibrary
     """Poses from which searches start."""
 
-        Args:
-            body: in SMPL's format.
-            source: where it is from, for messages.
-        """
-        self.body, self.source = body, source
-        has_shapes = body.num_betas > 0 and bool(body.shapedirs.abs().max() > 0)
-        self.surface = BodySurface.from_body(body, _VERTICES, betas=min(_BETAS, body.num_betas) if has_shapes else 0)
-        self._library = PoseLibrary.builtin(self.surface.joint_names)
-        self.prior = self._library.prior()
+    @cached_property
+    def prior(self) -> PosePrior:
+        """Of the poses."""
+        return self.library.prior()
 
     @cached_property
     def finder(self) -> PoseFinder:
         """Of poses in single frames."""
-        return PoseFinder(self.surface, self._library, self.prior)
+        return PoseFinder(self.surface, self.library, self.prior)
 
     @property
     def length_m(self) -> float:

@@ -5,8 +5,10 @@ the surface (Kazhdan et al., Poisson Surface Reconstruction, 2006). On a lattice
 Peng et al., Shape As Points, NeurIPS 2021), holes included: there it is as smooth as possible. Its values at the points should
 be equal; what is left is taken off around each point, which brings the surface back to the points.
 
-Measured on six poses of the built-in subjects, near the surface (1 cm of noise), against screened Poisson reconstruction of
-pymeshlab (depth 7 and 8) and winding numbers of the points: benchmarks/bm_points.py.
+Near the surface (1 cm of noise), on six poses of built-in subjects with 4,000 points, the IoU with the true mesh is 91.8 %, in
+0.15 s, and 85.9 % with 5 mm of noise. Screened Poisson reconstruction (pymeshlab) has 90.9 and 84.6 % at depth 7, in 0.9 s, and
+92.4 and 85.1 % at depth 8 with one sample per node, in 1.2 s; winding numbers of the points have 91.0 and 79.6 %
+(`benchmarks/bm_points.py`).
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from torch import Tensor
 from snarfcli.export.character import CharacterOptions
 from snarfcli.export.clips import Clip
 from snarfcli.export.export import ExportReport, export_character
+from snarfcli.export.html import HtmlConfig, export_html
 from snarfcli.export.joint_naming import named_joints
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.meshing.posed import posed_mesh
@@ -77,8 +78,46 @@ class Avatar(TrainedField):
         Raises:
             ValueError: the system has no skinning weights, the field has no surface, or an argument is out of range.
         """
-        several = [motions] if isinstance(motions, Motion | Clip) else motions
-        clips = [motion if isinstance(motion, Clip) else Clip(motion) for motion in several]
+        clips = _clips(motions)
         options = CharacterOptions(triangles, influences, morph_targets, resolution, weight_colors)
         joint_names = named_joints(self.skeleton.names, self.skeleton.parents, names)
         return export_character(self, path, clips, options, joint_names=joint_names, overwrite=overwrite)
+
+    def export_html(
+        self,
+        path: str | Path,
+        motions: Motion | Clip | Sequence[Motion | Clip],
+        *,
+        triangles: int | None = 20000,
+        morph_targets: int = 8,
+        resolution: int = 256,
+        title: str | None = None,
+        license: str | None = None,
+        overwrite: bool = False,
+    ) -> ExportReport:
+        """Write a page of at most 5 MB that plays the avatar offline, like `snarf export format=html`. It is whole or absent.
+
+        Args:
+            path: of the file.
+            motions: one or more; each becomes a clip.
+            triangles: maximum number of triangles; None for as many as fit.
+            morph_targets: maximum number of morph targets for the pose-dependent shape; 0 for the mean shape.
+            resolution: voxels along the longest side of the canonical box.
+            title: of the page; the subject by default.
+            license: a sentence; that of the data set by default.
+            overwrite: whether an existing file is replaced.
+
+        Returns:
+            Facts about the file; fewer triangles or frames than wanted if these would not fit.
+
+        Raises:
+            ValueError: as `export_glb`, or the motions do not fit.
+        """
+        options = CharacterOptions(triangles, 4, morph_targets, resolution)
+        return export_html(self, path, _clips(motions), options, HtmlConfig(title, license), overwrite=overwrite)[0]
+
+
+def _clips(motions: Motion | Clip | Sequence[Motion | Clip]) -> list[Clip]:
+    """Return motions and clips as clips."""
+    several = [motions] if isinstance(motions, Motion | Clip) else motions
+    return [motion if isinstance(motion, Clip) else Clip(motion) for motion in several]

@@ -1,6 +1,6 @@
 """What fits into a page of limited size: the number of triangles, and the frames of the clips.
 
-The sizes are those of `character_glb(compact=True)` before compression, so that a page is never larger than planned.
+The sizes are those of `character_glb(compact=True)` before compression.
 """
 
 from __future__ import annotations

@@ -20,12 +20,13 @@ from snarfcli.export.html_size import MOST_BYTES, PagePlan, plan_page
 from snarfcli.files import atomic_path
 from snarfcli.meshing.colors import bone_colors
 from snarfcli.models.trained_field import TrainedField
-from snarfcli.texts import counted
+from snarfcli.texts import counted, one_line
 
 __all__ = ["HtmlConfig", "export_html"]
 
 log = logging.getLogger(__name__)
 
+_LONGEST_NAME = 80
 _COMPRESSION = 2
 """How much smaller a character usually gets by compression; measured: 3.3 for a mesh with short motions."""
 
@@ -108,9 +109,10 @@ def _page(
         compact=True,
         facts={"snarf": report.facts()},
     )
+    colors = _css_colors(len(names))
     facts = {
-        "clips": [clip.name for clip in character.clips],
-        "bones": [{"name": joint, "color": color} for joint, color in zip(names, _css_colors(len(names)), strict=True)],
+        "clips": [one_line(clip.name, _LONGEST_NAME) for clip in character.clips],
+        "bones": [{"name": one_line(joint, _LONGEST_NAME), "color": color} for joint, color in zip(names, colors, strict=True)],
     }
     motions = counted(len(character.clips), "motion")
     size = f"{report.triangles:,} triangles, {counted(report.joints, 'bone')}, {motions}"

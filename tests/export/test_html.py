@@ -23,8 +23,10 @@ from snarfcli.export.character import CharacterOptions
 from snarfcli.export.clips import Clip
 from snarfcli.export.html import HtmlConfig, export_html
 from snarfcli.export.html_page import PageTexts, page_of, room_in_page
+from snarfcli.texts import one_line
 
 OPTIONS = CharacterOptions(triangles=600, resolution=40)
+PAGE = Path(html_export.__file__).parent / "page"
 HOSTILE = "</script></title><script>window.hacked = 1</script><img src=x onerror='window.hacked = 1'>\"&{{three}}\u2028\x1b[2J"
 
 
@@ -91,8 +93,8 @@ def test_texts_from_files_are_texts(exported):
     assert len(page.scripts()) == 2
     assert not [attributes for _, attributes in page.elements if "src" in attributes or "onerror" in attributes]
     facts = json.loads(page.texts["facts"])
-    assert [bone["name"] for bone in facts["bones"]] == names
-    assert facts["clips"] == ["wave", HOSTILE]
+    assert [bone["name"] for bone in facts["bones"]] == [one_line(name, 80) for name in names]
+    assert facts["clips"] == ["wave", one_line(HOSTILE, 80)]
     assert all(re.fullmatch("#[0-9a-f]{6}", bone["color"]) for bone in facts["bones"])
 
 
@@ -111,11 +113,19 @@ def test_the_policy_allows_the_own_scripts_and_style_only(exported):
 
 def test_three_js_is_there_with_its_licence(exported):
     three, _ = Reader(exported[0].read_bytes()).scripts()
-    folder = Path(html_export.__file__).parent / "page"
-    license_text = (folder / "three.LICENSE").read_text(encoding="utf-8")
+    license_text = (PAGE / "three.LICENSE").read_text(encoding="utf-8")
     assert "three.js authors" in license_text
     assert license_text in three[:2000]
     assert "</script" not in three
+
+
+def test_the_bundle_is_of_the_version_and_has_the_parts_that_are_used():
+    """Made again by tools/bundle_three.sh."""
+    versions = json.loads((Path(__file__).parents[1] / "readers" / "package.json").read_text())["dependencies"]
+    assert f"three.js {versions['three']}," in (PAGE / "three.min.js").read_text(encoding="utf-8")[:200]
+    (used,) = re.findall(r"const \{([^}]+)\} = SnarfThree;", (PAGE / "viewer.js").read_text(encoding="utf-8"))
+    exported = re.findall(r"export \{([^}]+)\}", (PAGE / "three.entry.mjs").read_text(encoding="utf-8"))
+    assert set(re.findall(r"\w+", used)) == set(re.findall(r"\w+", " ".join(exported)))
 
 
 def test_title_and_licence_are_chosen_or_those_of_the_data(exported, tmp_path):

@@ -30,8 +30,8 @@
   function lightedScene() {
     const scene = new Scene();
     scene.background = new Color(BACKGROUND);
-    scene.add(new HemisphereLight(0xffffff, 0x8a8078, 1.6));
-    for (const [x, y, z, strength] of [[2, 4, 3, 2.2], [-3, 2, -2, 0.8]]) {
+    scene.add(new HemisphereLight(0xffffff, 0xb5aca4, 2.0));
+    for (const [x, y, z, strength] of [[2, 4, 3, 1.7], [-3, 2, -2, 0.9]]) {
       const light = new DirectionalLight(0xffffff, strength);
       light.position.set(x, y, z);
       scene.add(light);

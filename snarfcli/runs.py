@@ -21,6 +21,8 @@ __all__ = ["check_device", "choose_device", "find_avatar", "machine_facts", "run
 
 log = logging.getLogger(__name__)
 
+_AVATAR_FILES = ("avatar.pt", "model.safetensors")
+
 
 def run_folder(output_root: str, data: str, subject: str, run: str) -> Path:
     """Return the folder of one run: `<output_root>/<data>/<subject>/<run>`.
@@ -42,7 +44,8 @@ def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str |
     """
     if ckpt is not None:
         path = Path(ckpt)
-        path = path / "avatar.pt" if path.is_dir() else path
+        if path.is_dir():  # of a run, or of Avatar.save_pretrained
+            path = next((file for file in map(path.joinpath, _AVATAR_FILES) if file.is_file()), path)
         if not path.is_file():
             raise UserError(f'no avatar at {ckpt} (ckpt); give the avatar.pt that "snarf train" has written')
         return path

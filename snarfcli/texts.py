@@ -6,9 +6,10 @@ run, megabytes. Every such text passes one of these functions on its way out.
 
 from __future__ import annotations
 
+import html
 import re
 
-__all__ = ["counted", "markdown_text", "one_line", "plain_markdown", "terminal_text"]
+__all__ = ["counted", "html_text", "markdown_text", "one_line", "plain_markdown", "terminal_text"]
 
 _LAYOUT = "\n\t"  # the only control characters that text on a terminal needs
 _PLAIN = re.compile(r"[\w .,:;()@+/-]*")  # marks that mean nothing in Markdown, within a line
@@ -60,3 +61,13 @@ def plain_markdown(text: str, longest: int = 500) -> str:
     """Return a text as one line for Markdown: as it is if nothing in it is mark-up, else as `markdown_text` does."""
     line = one_line(text, longest)
     return line if _PLAIN.fullmatch(line) else markdown_text(line, longest)
+
+
+def html_text(text: object, longest: int = 200) -> str:
+    """Return a value as one line for HTML, inside an element or a quoted attribute, that shows its characters.
+
+    Args:
+        text: the value.
+        longest: maximum number of characters before they are escaped.
+    """
+    return html.escape(one_line(str(text), longest))

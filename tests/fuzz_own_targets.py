@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import random
+import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -37,6 +38,93 @@ def avatar() -> Target:
 def avatar_use() -> Target:
     """Files of avatars, which are queried, meshed and turned into a character."""
     return _avatar_target("avatar_use", use_avatar)
+
+
+def safetensors() -> Target:
+    """Files of safetensors by themselves."""
+    from snarfcli.formats.safetensors import read_safetensors, safetensors_bytes
+
+    def seeds() -> list[bytes]:
+        arrays = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array([True, False]), "n": np.array(3)}
+        return [safetensors_bytes(arrays, {"format": "pt"}), safetensors_bytes({"e": np.zeros((0, 2))}, {})]
+
+    return Target("safetensors", ".safetensors", seeds, read_safetensors, _damaged_header)
+
+
+def _damaged_header(rng: random.Random, content: bytes) -> bytes:
+    """Damage the tree of the header of a file of safetensors; its length fits again."""
+    from tree_damage import damaged_json
+
+    (length,) = struct.unpack_from("<Q", content)
+    header = damaged_json(rng, content[8 : 8 + length])
+    return struct.pack("<Q", len(header)) + header + content[8 + length :]
+
+
+def pretrained() -> Target:
+    """Folders of `Avatar.save_pretrained`."""
+    from tiny_avatars import KINDS, tiny_avatar
+
+    from snarfcli.avatar import Avatar
+
+    def seeds() -> list[bytes]:
+        made = []
+        for kind in KINDS:
+            with tempfile.TemporaryDirectory() as folder:
+                tiny_avatar(kind).save_pretrained(folder)
+                made.append(_packed(Path(folder)))
+        return made
+
+    return Target(
+        "pretrained", ".pretrained", seeds, Avatar.from_pretrained, _damaged_pretrained, cost=4, unpack=_unpack_pretrained
+    )
+
+
+def _unpack_pretrained(content: bytes, scratch: Path) -> Path:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        archive.extractall(scratch)
+    return scratch
+
+
+def _damaged_pretrained(rng: random.Random, content: bytes) -> bytes:
+    """Damage the tensors or the configuration of an avatar; in most cases the checksum in the configuration fits again."""
+    from tree_damage import damaged_array, damaged_json
+
+    from snarfcli.formats.safetensors import read_safetensors, safetensors_bytes
+
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    tensors, config = "model.safetensors", "config.json"
+    kind = rng.random()
+    if kind < 0.15:
+        files[tensors] = rng.choice(DAMAGES)(rng, files[tensors], b"")
+    elif kind < 0.3:
+        files[tensors] = _damaged_header(rng, files[tensors])
+    elif kind < 0.7:
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / tensors).write_bytes(files[tensors])
+            arrays, metadata = read_safetensors(Path(folder) / tensors)
+        for _ in range(rng.choice([1, 1, 2])):
+            name = rng.choice(sorted(arrays))
+            try:
+                changed = {**arrays, name: damaged_array(rng, arrays[name])}
+                files[tensors] = safetensors_bytes(changed, metadata)
+                arrays = changed
+            except Exception:  # a type that the format has not
+                del arrays[name]
+                files[tensors] = safetensors_bytes(arrays, metadata)
+    if rng.random() < 0.9:
+        described = json.loads(files[config])
+        described["weights"]["sha256"] = hashlib.sha256(files[tensors]).hexdigest()
+        files[config] = json.dumps(described).encode()
+    if kind > 0.6:
+        files[config] = damaged_json(rng, files[config])
+    if rng.random() < 0.03:
+        del files[rng.choice(sorted(files))]
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
 
 
 def use_avatar(path: Path) -> object:
@@ -487,7 +575,6 @@ def mesh_obj() -> Target:
     return _mesh_target("mesh_obj", ".obj")
 
 
-OWN_TARGETS = (avatar, avatar_use, checkpoint, samples, resumed_samples, refined_poses, fitted_skeleton, fitted_poses,
-               fit_report, animation_record, planned_job,
-               job_status, durations, metrics, mesh_ply, mesh_obj)  # fmt: skip
+OWN_TARGETS = (avatar, avatar_use, safetensors, pretrained, checkpoint, samples, resumed_samples, refined_poses, fitted_skeleton,
+               fitted_poses, fit_report, animation_record, planned_job, job_status, durations, metrics, mesh_ply, mesh_obj)  # fmt: skip
 """Functions that each return one target with the name of the function."""

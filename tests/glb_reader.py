@@ -55,11 +55,11 @@ class GlbReader:
         width = _TYPES[accessor.type]
         dtype = np.dtype(_DTYPES[accessor.componentType])
         start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
-        assert not view.byteStride or view.byteStride == width * dtype.itemsize
-        values = np.frombuffer(self.binary, dtype, accessor.count * width, start)
+        stride = view.byteStride or width * dtype.itemsize
+        assert start + (accessor.count - 1) * stride + width * dtype.itemsize <= view.byteOffset + view.byteLength
+        values = np.ndarray((accessor.count, width), dtype, self.binary, start, (stride, dtype.itemsize))
         if accessor.normalized:
-            values = values / np.iinfo(dtype).max
-        values = values.reshape(accessor.count, width)
+            values = np.maximum(values / np.iinfo(dtype).max, -1)
         values = values.astype(np.int64 if values.dtype.kind in "iu" else np.float64)
         return values[:, 0] if width == 1 else values
 

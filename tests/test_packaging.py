@@ -64,6 +64,7 @@ def test_the_wheel_holds_what_is_needed_at_run_time(wheel, tmp_path):
     assert configuration
     assert sources
     others = {"snarf/py.typed", "snarfcli/py.typed", "snarfcli/bodies/body_cc0.npz"}
+    others |= {f"snarfcli/export/page/{path.name}" for path in (ROOT / "snarfcli/export/page").iterdir()}
     assert configuration | sources | modules | others <= names
     assert [name for name in names if "libsnarf_native" in name] == [_native_name()]
     assert all(name.startswith(("snarf/", "snarfcli/", "snarf-")) for name in names)

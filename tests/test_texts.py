@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import re
 
-from snarfcli.texts import counted, markdown_text, one_line, plain_markdown, terminal_text
+from snarfcli.texts import counted, html_text, markdown_text, one_line, plain_markdown, terminal_text
 
 HOSTILE = "a\x1b]0;title\x07\x1b[2J\r\u202eb\u2028\x9b31m\ud800"
 
@@ -46,3 +46,11 @@ def test_plain_markdown_stays_readable_unless_something_in_it_is_mark_up():
     assert plain_markdown("train: loss is NaN (step 7)\n") == "train: loss is NaN (step 7)"
     assert plain_markdown("a <b>") == "a &#60;b&#62;"
     assert plain_markdown("x" * 9, 3) == "xxx"
+
+
+def test_html_shows_the_characters_of_a_text():
+    hostile = "</title><script>alert('x')</script> &amp; \"a\" " + HOSTILE
+    safe = html_text(hostile)
+    assert not set("<>\"'") & set(safe)
+    assert html.unescape(safe) == one_line(hostile, 200)
+    assert html_text("<" * 500, 300) == "&lt;" * 300

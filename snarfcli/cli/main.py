@@ -13,6 +13,7 @@ from snarfcli.cli.command_list import COMMANDS, Command
 from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.help import command_help, overview
 from snarfcli.cli.messages import user_message
+from snarfcli.cli.start import start_page
 from snarfcli.cli.terminal import abandon_output, output_failure, print_error, set_up_output
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.home import expand_home
@@ -43,7 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     _open_standard_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
+    if not arguments:
+        return _print(start_page())
+    if arguments[0] in ("-h", "--help", "help"):
         return _print(overview())
     if arguments[0] in ("-V", "--version"):
         return _print(f"snarf {snarfcli.__version__}")

@@ -28,6 +28,7 @@ from snarfcli.export.character import CharacterOptions
 from snarfcli.export.character_surface import character_surface, check_avatar
 from snarfcli.export.clips import Clip
 from snarfcli.export.export import ExportReport, export_character
+from snarfcli.export.html import export_html
 from snarfcli.export.human_bones import human_bones
 from snarfcli.export.joint_naming import named_joints
 from snarfcli.export.sequence import atomic_folder, write_sequence
@@ -75,7 +76,8 @@ def run(config: ExportConfig) -> int:
         motion = clip.motion
         log.info("motion: %s, %s at %g per second", motion.name, counted(motion.num_frames, "frame"), motion.frame_rate)
     files = clip_files(config, output, [clip.motion.name for clip in clips], "vrma") if config.format == "vrm" else []
-    write = _write_meshes if config.format in MESH_WRITERS else _write_vrm if config.format == "vrm" else _write_character
+    writers = {"vrm": _write_vrm, "html": _write_html, **dict.fromkeys(MESH_WRITERS, _write_meshes)}
+    write = writers.get(config.format, _write_character)
     job = _Job(config, avatar, path, clips, options, output, files, blender, time.perf_counter())
     with writing(config, output, files):
         lines, skipped = write(job)
@@ -166,6 +168,22 @@ def _write_vrm(job: _Job) -> _Written:
     names = [file.name for file in job.files]
     job.record(job.output, {"file": job.output.name, "bytes": report.num_bytes, "clip_files": names, **report.facts()})
     return [*report.lines(), f"{job.output}: {report.num_bytes / 1e6:.2f} MB; clips in {', '.join(names)}"], report.skipped
+
+
+def _write_html(job: _Job) -> _Written:
+    """Write the page."""
+    report, notes = export_html(
+        job.avatar,
+        job.output,
+        job.clips,
+        job.options,
+        job.config.html,
+        name=job.subject,
+        joint_names=job.joint_names,
+        overwrite=True,
+    )
+    job.record(job.output, {"file": job.output.name, "bytes": report.num_bytes, "reduced": notes, **report.facts()})
+    return [*report.lines(), *notes, f"{job.output}: {report.num_bytes / 1e6:.2f} MB; open it in a browser"], report.skipped
 
 
 def _write_meshes(job: _Job) -> _Written:

@@ -13,6 +13,7 @@ from snarfcli.export.blender import BLENDER_FORMATS
 from snarfcli.export.bvh import BVH_ORDERS, UNITS
 from snarfcli.export.character import CharacterOptions, check_options
 from snarfcli.export.clips import HEIGHTS
+from snarfcli.export.html import HtmlConfig
 from snarfcli.export.joint_naming import NAMINGS
 from snarfcli.export.vrm_meta import VrmMeta, check_meta
 from snarfcli.meshing.mesh_files import MESH_WRITERS
@@ -21,7 +22,7 @@ __all__ = ["FORMATS", "BvhConfig", "ExportConfig", "check_settings"]
 
 log = logging.getLogger(__name__)
 
-FORMATS = ("glb", "vrm", "bvh", *MESH_WRITERS, *BLENDER_FORMATS)
+FORMATS = ("glb", "html", "vrm", "bvh", *MESH_WRITERS, *BLENDER_FORMATS)
 """Choices for the format."""
 _SKELETONS = ("avatar", "file")
 
@@ -48,8 +49,9 @@ class ExportConfig(MotionSelection, AvatarSelection):
     """Built-in motions (SMPL) or sequences of the samples (other skeletons); each becomes one clip. Without motions and pose
     files: jumping_jacks or the held-out sequence."""
     format: str = MISSING
-    """glb (mesh, rig, clips and shapes in one file), fbx or usd (the same, needs Blender), vrm (the same for VRM 1.0, with one
-    .vrma per clip), bvh (the motion only, one file per clip), ply or obj (one mesh per frame)."""
+    """glb (mesh, rig, clips and shapes in one file), html (the same as a page that plays offline, at most 5 MB), fbx or usd
+    (the same, needs Blender), vrm (the same for VRM 1.0, with one .vrma per clip), bvh (the motion only, one file per clip),
+    ply or obj (one mesh per frame)."""
     names: str | None = MISSING
     """Names of the joints of a human: smpl, mixamo, vrm or unreal; null for the skeleton's own."""
     skeleton: str = MISSING
@@ -71,6 +73,8 @@ class ExportConfig(MotionSelection, AvatarSelection):
     """Settings of format=bvh."""
     vrm: VrmMeta = field(default_factory=VrmMeta)
     """Settings of format=vrm."""
+    html: HtmlConfig = field(default_factory=HtmlConfig)
+    """Settings of format=html."""
     output: str | None = MISSING
     """Output file, or folder for ply and obj; null for export/<subject>.<format> beside the avatar."""
     overwrite: bool = MISSING

@@ -56,7 +56,7 @@ class AvatarSelection:
     run: str = MISSING
     """Name of the run."""
     ckpt: str | None = MISSING
-    """Avatar file or run folder to use instead; results are written beside it."""
+    """Avatar file, or folder of a run or of Avatar.save_pretrained, to use instead; results are written beside it."""
     device: str = MISSING
     """auto, cpu, cuda or cuda:N."""
     threads: int | None = MISSING

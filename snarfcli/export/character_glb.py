@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.export.character import Character, CharacterClip
+from snarfcli.export.compact import QUANTIZATION, StoredCube, shares, signed_bytes, signed_shares
 from snarfcli.export.glb import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, GlbBuilder
 from snarfcli.export.rig import decompose, local_frames
 from snarfcli.meshing.colors import from_srgb, weights_to_colors
@@ -53,6 +54,7 @@ def character_glb(
     *,
     name: str = "avatar",
     weight_colors: bool = False,
+    compact: bool = False,
     facts: dict[str, Any] | None = None,
 ) -> tuple[GlbBuilder, CharacterNodes]:
     """Return the content of a file with a character.
@@ -66,14 +68,19 @@ def character_glb(
         parents: parents of the J joints, -1 for a root.
         name: name of the mesh; the parent of all joints is called `name_rig`.
         weight_colors: whether vertices are coloured by their weights.
+        compact: whether vertices, weights and rotations are stored as numbers of 8 and 16 bits, in about half of the bytes
+            (the extension KHR_mesh_quantization), which three.js reads and few other programs do.
         facts: content of `asset.extras`.
 
     Returns:
         The file, to which more can be added before it is written, and its nodes.
     """
     builder = GlbBuilder(**(facts or {}))
+    cube = StoredCube.around(character) if compact else None
+    if compact:
+        builder.root |= {"extensionsUsed": [QUANTIZATION], "extensionsRequired": [QUANTIZATION]}
     roots = [2 + joint for joint, parent in enumerate(parents) if parent < 0]
-    mesh_node = builder.add("nodes", name=name, mesh=_add_mesh(builder, character, name, weight_colors), skin=0)
+    mesh_node = builder.add("nodes", name=name, mesh=_add_mesh(builder, character, name, weight_colors, cube), skin=0)
     armature = builder.add("nodes", name=f"{name}_rig", children=roots)
     first = len(builder.root["nodes"])
     rest = decompose(local_frames(character.bind[None], parents))
@@ -90,47 +97,55 @@ def character_glb(
         )
     builder.add("scenes", name=name, nodes=[mesh_node, armature])
     builder.root["scene"] = 0
+    joints_from_metres = np.linalg.inv(character.bind)
     builder.add(
         "skins",
         name=name,
         joints=list(range(first, first + len(parents))),
-        inverseBindMatrices=builder.array(np.linalg.inv(character.bind)),
+        inverseBindMatrices=builder.array(joints_from_metres if cube is None else joints_from_metres @ cube.metres_from_stored),
         skeleton=armature,
     )
     moving = {path: _moving(character.clips, path, getattr(rest, path)[0]) for path in _MOVES}
     # A clip needs at least one channel, which also gives its length.
     moving["translation"][roots[0] - first] = moving["rotation"][roots[0] - first] = True
     for clip in character.clips:
-        _add_clip(builder, clip, moving, first, mesh_node if len(character.shapes.targets) else None)
+        _add_clip(builder, clip, moving, first, mesh_node if len(character.shapes.targets) else None, compact)
     return builder, CharacterNodes(mesh_node, first)
 
 
-def _add_mesh(builder: GlbBuilder, character: Character, name: str, weight_colors: bool) -> int:
+def _add_mesh(builder: GlbBuilder, character: Character, name: str, weight_colors: bool, cube: StoredCube | None) -> int:
     """Add the mesh with its attributes, morph targets and material; return its index."""
     mesh = character.mesh
     assert mesh.normals is not None
     assert mesh.weights is not None
-    attributes = {
-        "POSITION": builder.array(mesh.vertices, target=ARRAY_BUFFER, bounds=True),
-        "NORMAL": builder.array(_units(mesh.normals), target=ARRAY_BUFFER),
-    }
+
+    def places(values: NDArray, *, are_moves: bool = False) -> int:
+        if cube is None:
+            return builder.array(values, target=ARRAY_BUFFER, bounds=True)
+        stored = cube.moves(values) if are_moves else cube.places(values)
+        return builder.array(stored, "int16", target=ARRAY_BUFFER, bounds=True, normalized=True)
+
+    def normals(values: NDArray) -> int:
+        if cube is None:
+            return builder.array(values, target=ARRAY_BUFFER)
+        return builder.array(signed_bytes(values), "int8", target=ARRAY_BUFFER, normalized=True)
+
+    attributes = {"POSITION": places(mesh.vertices), "NORMAL": normals(_units(mesh.normals))}
     if weight_colors:
         colors = _linear(weights_to_colors(mesh.weights))
         attributes["COLOR_0"] = builder.array(colors, "uint16", target=ARRAY_BUFFER, normalized=True)
     joint_type = "uint8" if len(character.bind) <= 256 else "uint16"
-    for number, start in enumerate(range(0, character.joints.shape[1], 4)):
+    weights = character.weights if cube is None else shares(character.weights)
+    weight_type, options = ("float32", {}) if cube is None else ("uint16", {"normalized": True})
+    joints = np.where(weights > 0, character.joints, 0)  # as the format asks for; small weights are rounded to 0
+    for number, start in enumerate(range(0, joints.shape[1], 4)):
         part = slice(start, start + 4)
-        attributes[f"JOINTS_{number}"] = builder.array(character.joints[:, part], joint_type, target=ARRAY_BUFFER)
-        attributes[f"WEIGHTS_{number}"] = builder.array(character.weights[:, part], target=ARRAY_BUFFER)
+        attributes[f"JOINTS_{number}"] = builder.array(joints[:, part], joint_type, target=ARRAY_BUFFER)
+        attributes[f"WEIGHTS_{number}"] = builder.array(weights[:, part], weight_type, target=ARRAY_BUFFER, **options)
     targets = []
     for moved in character.shapes.targets:
         bent = vertex_normals(mesh.vertices + moved, mesh.faces) - mesh.normals
-        targets.append(
-            {
-                "POSITION": builder.array(moved, target=ARRAY_BUFFER, bounds=True),
-                "NORMAL": builder.array(bent, target=ARRAY_BUFFER),
-            }
-        )
+        targets.append({"POSITION": places(moved, are_moves=True), "NORMAL": normals(bent)})
     index_type = "uint16" if len(mesh.vertices) < 2**16 else "uint32"  # 65535 is reserved
     material = builder.add(
         "materials",
@@ -157,7 +172,12 @@ def _add_mesh(builder: GlbBuilder, character: Character, name: str, weight_color
 
 
 def _add_clip(
-    builder: GlbBuilder, clip: CharacterClip, moving: dict[str, NDArray[np.bool_]], first: int, mesh_node: int | None
+    builder: GlbBuilder,
+    clip: CharacterClip,
+    moving: dict[str, NDArray[np.bool_]],
+    first: int,
+    mesh_node: int | None,
+    compact: bool,
 ) -> None:
     """Add an animation; constant channels keep their first and last key only."""
     count = len(clip.joints.rotation)
@@ -175,7 +195,11 @@ def _add_clip(
         if number not in time_arrays:
             time_arrays[number] = builder.array(times[keys], bounds=True)
         flat = values[keys].reshape(-1) if path == "weights" else values[keys]
-        samplers.append({"input": time_arrays[number], "output": builder.array(flat), "interpolation": "LINEAR"})
+        if compact and path in ("rotation", "weights"):
+            output = builder.array(signed_shares(flat), "int16", normalized=True)
+        else:
+            output = builder.array(flat)
+        samplers.append({"input": time_arrays[number], "output": output, "interpolation": "LINEAR"})
         channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
 
     for path, which in moving.items():

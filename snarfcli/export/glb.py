@@ -22,7 +22,7 @@ ARRAY_BUFFER = 34962
 ELEMENT_ARRAY_BUFFER = 34963
 """Target of a buffer view with triangle indices."""
 
-_COMPONENTS = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+_COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _LARGEST = 2**32 - 1  # lengths are 32-bit numbers
@@ -54,13 +54,14 @@ class GlbBuilder:
 
         Args:
             values: [N] numbers, [N, 2..4] vectors, or [N, 4, 4] matrices, which glTF stores by columns.
-            dtype: uint8, uint16, uint32 or float32.
-            target: use of the buffer view by graphics cards, for vertex attributes and triangle indices.
+            dtype: int8, uint8, int16, uint16, uint32 or float32.
+            target: use of the buffer view by graphics cards, for vertex attributes and triangle indices. Rows of vertex
+                attributes start at multiples of 4 bytes, as the format asks for.
             bounds: whether minimum and maximum are written, which positions and times need.
             more: further properties, such as `normalized`.
 
         Raises:
-            ValueError: the shape is another one, a number is not finite, or rows are not aligned to 4 bytes.
+            ValueError: the shape is another one, or a number is not finite.
         """
         values = np.asarray(values).astype(dtype)
         if not values.size or not np.isfinite(values).all():
@@ -73,11 +74,16 @@ class GlbBuilder:
             kind = _KINDS[rows.shape[1]]
         else:
             raise ValueError(f"values: wanted shape [N], [N, 2 to 4] or [N, 4, 4], got {list(values.shape)}")
-        if target == ARRAY_BUFFER and rows.strides[0] % 4:
-            raise ValueError(f"values: wanted rows aligned to 4 bytes, got rows of {rows.strides[0]} bytes")
+        stride = None
+        stored = rows
+        if target == ARRAY_BUFFER and (row := rows.shape[1] * rows.itemsize) % 4:
+            stride = row + -row % 4
+            stored = np.zeros((len(rows), stride // rows.itemsize), rows.dtype)
+            stored[:, : rows.shape[1]] = rows
         self._binary.extend(b"\0" * (-len(self._binary) % 4))
-        content = np.ascontiguousarray(rows, rows.dtype.newbyteorder("<")).tobytes()
-        view = self.add("bufferViews", buffer=0, byteOffset=len(self._binary), byteLength=len(content), target=target)
+        content = np.ascontiguousarray(stored, rows.dtype.newbyteorder("<")).tobytes()
+        place = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": len(content)}
+        view = self.add("bufferViews", **place, byteStride=stride, target=target)
         self._binary.extend(content)
         limits = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()} if bounds else {}
         return self.add(

@@ -17,7 +17,8 @@ _PACKAGES = {
         "PIL": "pillow",
         "scipy": "scipy",
         "skimage": "scikit-image",
-    }
+    },
+    "hub": {"huggingface_hub": "huggingface-hub"},
 }
 
 

@@ -11,7 +11,7 @@ import torch
 from snarfcli.errors import UserError
 from snarfcli.formats.torch_files import read_plain_torch
 
-__all__ = ["load_checkpoint"]
+__all__ = ["check_format", "load_checkpoint"]
 
 
 def load_checkpoint(path: str | Path, file_format: str, version: int, what: str) -> dict[str, Any]:
@@ -29,14 +29,22 @@ def load_checkpoint(path: str | Path, file_format: str, version: int, what: str)
     path = Path(path)
     if not path.exists():
         raise UserError(f'no {what} at {path}; train one with "snarf train" or name another file')
-    content = read_plain_torch(path, what)
+    return _with_tensors(check_format(read_plain_torch(path, what), file_format, version, what, path), {})
+
+
+def check_format(content: Any, file_format: str, version: int, what: str, path: Path) -> dict[str, Any]:
+    """Return the content of a file if it says that it is of a format and version.
+
+    Raises:
+        UserError: it is not; the message names the file `path`.
+    """
     if not isinstance(content, dict) or type(content.get("format")) is not str or content["format"] != file_format:
         raise UserError(f'{path} is not a snarf {what}; give the file that "snarf train" wrote')
     came = content.get("version")
     if type(came) is not int or came != version:
         shown = came if type(came) is int else "none"
         raise UserError(f"{what} {path}: wanted format version {version}, got {shown}; train it again, or get it again")
-    return _with_tensors(content, {})
+    return content
 
 
 def _with_tensors(content: Any, done: dict[int, Any]) -> Any:

@@ -28,6 +28,7 @@ from snarfcli.models.file_tensors import FARTHEST_M, load_state, read_state, rea
 from snarfcli.models.in_parts import points_in_parts, queries_in_parts
 from snarfcli.models.nasa import Nasa
 from snarfcli.models.pose_onet import PoseONet
+from snarfcli.models.pretrained import TENSORS_FILE, is_pretrained, read_pretrained
 from snarfcli.models.settings import AvatarConfig
 from snarfcli.models.smpl_nn import SmplNN
 from snarfcli.models.system import NO_CORRESPONDENCE, FieldSamples, Found, System
@@ -71,6 +72,8 @@ class TrainedField:
         ValueError: the configuration is not of a system, or does not fit the skeleton.
     """
 
+    file: Path | None = None
+    """The file it was loaded from."""
     _precision = "highest"  # of the shape network, see `with_precision`
 
     def __init__(
@@ -116,13 +119,21 @@ class TrainedField:
 
     @classmethod
     def load(cls, path: str | Path, device: str | torch.device = "cpu") -> Self:
-        """Read an avatar from its file, or from `avatar.pt` in a run folder, ready to use on `device`.
+        """Read an avatar from its file, or from a run folder or one of `save_pretrained`, ready to use on `device`.
 
         Raises:
             UserError: the file is missing, damaged, not an avatar, or of another format version.
         """
-        path = Path(path) / "avatar.pt" if Path(path).is_dir() else Path(path)
-        return cls.from_dict(load_checkpoint(path, FORMAT, FORMAT_VERSION, "avatar"), path).to(device)
+        path = Path(path)
+        if path.is_dir():
+            path = path / (TENSORS_FILE if is_pretrained(path) and not (path / "avatar.pt").exists() else "avatar.pt")
+        if path.name == TENSORS_FILE:
+            content = read_pretrained(path.parent, FORMAT, FORMAT_VERSION)
+        else:
+            content = load_checkpoint(path, FORMAT, FORMAT_VERSION, "avatar")
+        avatar = cls.from_dict(content, path).to(device)
+        avatar.file = path
+        return avatar
 
     @classmethod
     def from_dict(cls, content: dict[str, Any], path: str | Path = "avatar") -> Self:

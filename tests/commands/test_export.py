@@ -111,6 +111,25 @@ def test_frames_rate_and_place_are_chosen_as_for_animate(folder, capsys):
     assert np.ptp(ways[:, [0, 2]], axis=0).max() < 1e-6 < np.ptp(ways[:, 1])
 
 
+def test_a_page(folder, capsys, caplog):
+    with caplog.at_level(logging.INFO):
+        walk = pose_file("walk.npz")
+        code, err = export(capsys, "--pose", walk, "format=html", "html.title=Nine & one", "html.license=Mine alone.")
+    assert (code, err) == (0, "")
+    page = (folder / "export" / "50002.html").read_text(encoding="utf-8")
+    assert "<h1>Nine &amp; one</h1>" in page
+    assert "<p>Licence: Mine alone.</p>" in page
+    record = json.loads((folder / "export" / "50002_html.json").read_text())
+    assert record["bytes"] == len(page.encode())
+    assert record["reduced"] == []
+    assert "50002.html: 0.68 MB; open it in a browser" in " ".join(caplog.text.split())
+    code, err = export(capsys, "--pose", walk, "format=html")
+    assert code == 2
+    assert "50002.html exists already; give overwrite=true to replace it" in err
+    code, err = export(capsys, "--pose", walk, "format=html", "output=a.htm")
+    assert "output: wanted a name ending in .html, got a.htm" in err
+
+
 @pytest.mark.parametrize("suffix", ["ply", "obj"])
 def test_a_mesh_a_frame(folder, toy, capsys, suffix):
     arguments = ("--pose", pose_file("walk.npz", 4), f"format={suffix}", "weight_colors=true")
@@ -312,7 +331,7 @@ def test_frames_without_shape_end_with_1(folder, capsys, caplog, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["format=gltf"], "format: wanted glb, vrm, bvh, ply, obj, fbx or usd, got 'gltf'; did you mean"),
+        (["format=gltf"], "format: wanted glb, html, vrm, bvh, ply, obj, fbx or usd, got 'gltf'; did you mean"),
         (["influences=3"], "influences.* 4 or 8, got 3"),
         (["format=vrm", "vrm.modification=all"], "vrm.modification: wanted prohibited, allowModification or"),
         (["triangles=50"], "triangles: wanted 100 to 5000000, got 50"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 import threading
 from dataclasses import replace
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from chromium_page import CHROMIUM, needs_chromium
 from glb_reader import READERS, SCRIPTS, needs_readers
 from toy_character import FRAME_RATE, ToyCharacter, wave
 
@@ -21,7 +21,6 @@ from snarfcli.export.character import CharacterOptions
 from snarfcli.export.clips import Clip
 from snarfcli.export.export import export_character
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FRAMES = (0, 5, 11)
 
 
@@ -46,6 +45,7 @@ def served(tmp_path):
 
 def draw(address: str, clip: str, times: list[float], profile: Path) -> dict:
     query = f"file=worm.glb&clip={clip}&times={','.join(map(str, times))}"
+    assert CHROMIUM is not None
     command = [
         CHROMIUM, "--headless=new", "--no-sandbox", f"--user-data-dir={profile}", "--no-first-run", "--disable-extensions",
         "--disable-background-networking", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -58,7 +58,7 @@ def draw(address: str, clip: str, times: list[float], profile: Path) -> dict:
 
 
 @needs_readers
-@pytest.mark.skipif(CHROMIUM is None, reason="wants Chromium")
+@needs_chromium
 def test_the_silhouettes_are_those_of_the_skinned_surface(tmp_path, served):
     toy, motion = ToyCharacter(), wave()
     motion = replace(motion, translation=motion.translation - [0.5, 1, 0])  # into the middle of the picture

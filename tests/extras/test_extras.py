@@ -135,7 +135,7 @@ def test_the_extra_has_every_package_that_is_imported():
     listed = {name: set(re.findall(r'"([\w-]+)[><=]', content)) for name, content in lists}
     assert listed["dependencies"] == {"numpy", "torch"}
     packages = {"hydra": "hydra-core", "igl": "libigl", "PIL": "pillow", "skimage": "scikit-image"}
-    allowed = listed["commands"] | listed["dependencies"] | listed["view"] | listed["blender"]
+    allowed = listed["commands"] | listed["dependencies"] | listed["view"] | listed["blender"] | listed["hub"]
     allowed |= {"omegaconf", "msgspec", "typing-extensions", "websockets"}  # which come with hydra-core, viser and torch
     own = {"snarfcli", *sys.stdlib_module_names}
     for path in (ROOT / "snarfcli").rglob("*.py"):
@@ -146,7 +146,7 @@ def test_the_extra_has_every_package_that_is_imported():
                 assert packages.get(top, top.replace("_", "-")) in allowed, path
 
 
-@pytest.mark.parametrize("extra", ["test", "joblib", "submitit", "view", "blender"])
+@pytest.mark.parametrize("extra", ["test", "joblib", "submitit", "view", "hub", "blender"])
 def test_other_extras_bring_the_commands(extra):
     (content,) = re.findall(rf"^{extra} = \[(.*?)\]$", (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL)
     assert '"snarf[commands]"' in content

@@ -150,6 +150,7 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
     from omegaconf import OmegaConf
 
     from snarfcli.cli.multirun import NOTE_FOLDER, ExitCodes, lost_job, slot_of_job
+    from snarfcli.hydra_config.help_texts import lazy_help_texts
 
     codes = ExitCodes()
 
@@ -171,7 +172,8 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
     before = sys.argv
     sys.argv = [f"snarf {command.name}", *_HYDRA_SETTINGS, NOTE_FOLDER, *overrides]
     try:
-        entry()
+        with lazy_help_texts():
+            entry()
     except Exception as error:
         if (lost := lost_job(error)) is not None:
             raise UserError(lost) from error

@@ -9,8 +9,8 @@ from snarfcli.sampling.triangles import uniform_in_triangles
 
 __all__ = ["poisson_disks"]
 
-# Number of times that as many candidates are drawn as samples are wanted. With six rounds the standard deviation of the spacing is
-# 10 %, as with MeshLab's settings in surface.py; ten rounds take twice as long for 9 %.
+# Number of times that as many candidates are drawn as samples are wanted. With six rounds the standard deviation of the spacing
+# is 10 %, as with MeshLab's settings in surface.py; ten rounds take twice as long for 9 %.
 _ROUNDS = 6
 # Squared radius of a disk over the area per sample: 1.01 to 1.04 times as many disks as wanted, from 1,000 on, fit on a body, a
 # sphere, a thin capsule and a box. On a sheet thinner than the radius, whose sides count as one, it is 0.6 times as many.

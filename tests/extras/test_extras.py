@@ -135,7 +135,9 @@ def test_the_extra_has_every_package_that_is_imported():
     listed = {name: set(re.findall(r'"([\w-]+)[><=]', content)) for name, content in lists}
     assert listed["dependencies"] == {"numpy", "torch"}
     packages = {"hydra": "hydra-core", "igl": "libigl", "PIL": "pillow", "skimage": "scikit-image"}
-    allowed = listed["commands"] | listed["dependencies"] | listed["view"] | listed["blender"]
+    assert listed["commands"] == {"pymeshlab"}
+    assert "pymeshlab" not in listed["commands-without-gpl"]
+    allowed = listed["commands"] | listed["commands-without-gpl"] | listed["dependencies"] | listed["view"] | listed["blender"]
     allowed |= {"omegaconf", "msgspec", "typing-extensions", "websockets"}  # which come with hydra-core, viser and torch
     own = {"snarfcli", *sys.stdlib_module_names}
     for path in (ROOT / "snarfcli").rglob("*.py"):

@@ -123,7 +123,8 @@ class _TreeMesh:
 
     def _run(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rays = (np.ascontiguousarray(origins, np.float64), np.ascontiguousarray(directions, np.float64))
-        return self._tree.intersect_ray_first(self._vertices, self._faces, *rays)
+        triangle, distance, weights = self._tree.intersect_ray_first(self._vertices, self._faces, *rays)
+        return np.asarray(triangle), np.asarray(distance), np.asarray(weights)
 
 
 def _tree(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, igl.AABB]:

@@ -109,8 +109,8 @@ import snarf.motions
 def test_commands_say_what_to_install():
     code = """
 from snarfcli.cli.main import main
-assert [main([flag]) for flag in ("--help", "--version")] == [0, 0]
-assert [main(arguments) for arguments in (["train", "subject=50002"], ["eval", "--help"], ["doctor"])] == [2, 2, 2]
+assert [main(arguments) for arguments in (["--help"], ["--version"], ["eval", "--help"])] == [0, 0, 0]
+assert [main(arguments) for arguments in (["train", "subject=50002"], ["eval", "--ood"], ["doctor"])] == [2, 2, 2]
 """
     done = run_light(code)
     assert done.returncode == 0, done.stderr

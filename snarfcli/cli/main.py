@@ -13,7 +13,13 @@ from snarfcli.cli.command_list import COMMANDS, Command
 from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.help import command_help, overview
 from snarfcli.cli.messages import user_message
-from snarfcli.cli.terminal import abandon_output, output_failure, print_error, set_up_output
+from snarfcli.cli.terminal import (
+    abandon_output,
+    escape_what_cannot_be_shown,
+    output_failure,
+    print_error,
+    set_up_output,
+)
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import check_overrides, readable
@@ -42,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0, 1 (partly failed), 2 (user error), 130 (Ctrl-C), 143 (SIGTERM) or 129 (SIGHUP).
     """
     _open_standard_streams()
+    escape_what_cannot_be_shown()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         return _print(overview())

@@ -1,9 +1,9 @@
 """The dataclass of a command as its source describes it: for --help, without importing PyTorch and all that the command needs.
 
-DESIGN. The help shows names and descriptions of fields, which stand in the source. Reading a class takes milliseconds, importing
-its module a second or more. Only what the settings use is understood: annotated fields, base classes, and names that are
-defined in the module or imported from another one of the package. `describe` and `group_schemas` give the same for a class that is
-imported.
+DESIGN. The help shows names and descriptions of fields, which stand in the source. Reading a class takes milliseconds,
+importing its module a second or more. Only what the settings use is understood: annotated fields, base classes, and names that
+are defined in the module or imported from another one of the package. `describe` and `group_schemas` give the same for an
+imported class.
 """
 
 from __future__ import annotations

@@ -9,12 +9,15 @@ SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
 C_FAMILY = $(shell find csrc benchmarks tests/native tests/pretend_gpu tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
 
-.PHONY: help setup demo test fuzz trust sanitize lint format bench gpu clean
+.PHONY: help setup demo test lowest platforms wheels fuzz trust sanitize lint format bench gpu clean
 
 help:
 	@echo "make setup     install snarf into $(VENV)"
 	@echo "make demo      run the whole pipeline on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
 	@echo "make test      run the tests"
+	@echo "make lowest    run the tests of files, samples, pictures and commands with the oldest packages that pyproject.toml allows"
+	@echo "make platforms resolve the packages for every Python and platform, and write docs/platforms.md"
+	@echo "make wheels    build wheels for this platform with cibuildwheel, and try them"
 	@echo "make fuzz      read 20,000 damaged files with every file reader, 5,000 with slow ones"
 	@echo "make trust     crash, disturb and attack the commands, and measure their memory, for some hours (Linux)"
 	@echo "make sanitize  test the native library built with AddressSanitizer and UndefinedBehaviorSanitizer (Linux)"
@@ -41,6 +44,19 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	tools/fetch_nvrtc.sh $(VENV)
 	$(VENV)/bin/python -m pytest -q -n auto
+
+lowest:
+	tools/test_lowest.sh $(PYTHON)
+
+platforms: build/packaging
+	build/packaging/bin/python tools/platforms.py
+
+wheels: build/packaging
+	build/packaging/bin/python -m cibuildwheel --output-dir build/wheels
+
+build/packaging:
+	$(PYTHON) -m venv $@
+	$@/bin/python -m pip install --quiet uv cibuildwheel || { rm -rf $@; exit 1; }
 
 fuzz: $(INSTALLED)
 	$(VENV)/bin/python tools/fuzz_readers.py

@@ -9,7 +9,7 @@ import itertools
 import textwrap
 from typing import Any, TypeVar
 
-__all__ = ["documented", "field_texts"]
+__all__ = ["documented", "field_texts", "texts_of_class"]
 
 _WIDTH = 100  # of the lines that help() shows
 
@@ -39,9 +39,17 @@ def _own_texts(owner: type) -> dict[str, str]:
         found = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
     except (OSError, TypeError, SyntaxError):  # a class without a file, or with one that has changed since
         return {}
-    body = [part for one in found if isinstance(one, ast.ClassDef) and one.name == owner.__name__ for part in one.body]
     texts: dict[str, str] = {}
-    for field, below in itertools.pairwise(body):
+    for one in found:
+        if isinstance(one, ast.ClassDef) and one.name == owner.__name__:
+            texts |= texts_of_class(one)
+    return texts
+
+
+def texts_of_class(definition: ast.ClassDef) -> dict[str, str]:
+    """Return the string literals that stand below the fields of a class in parsed source, by field, each in one line."""
+    texts: dict[str, str] = {}
+    for field, below in itertools.pairwise(definition.body):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
             literal = below.value
             if isinstance(literal, ast.Constant) and isinstance(literal.value, str):

@@ -112,9 +112,9 @@ def flush_to_disk(path: Path) -> None:
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write `content` as indented JSON, complete or not at all."""
+    """Write `content` as indented JSON, complete or not at all; the same bytes on every system."""
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        temporary.write_bytes((json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
 
 
 def write_tensors(path: str | Path, content: Any) -> None:

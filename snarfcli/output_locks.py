@@ -64,7 +64,7 @@ def hold_output(output: str | Path, command: str, *, wait: bool = False) -> Iter
         release = _await(path, about, output, wait)
     try:
         with suppress(OSError):  # a full disk, which the work itself will report
-            about.write_text(json.dumps(_myself(command)))
+            about.write_text(json.dumps(_myself(command)), encoding="utf-8")
         yield
     finally:
         with suppress(OSError):
@@ -177,7 +177,7 @@ def _myself(command: str) -> dict[str, Any]:
 def _read(about: Path) -> dict[str, Any] | None:
     """Return who holds a lock, None if it is not known."""
     with suppress(OSError, ValueError, RecursionError):
-        content = json.loads(about.read_text()[:10000])
+        content = json.loads(about.read_text(encoding="utf-8")[:10000])
         if isinstance(content, dict) and all(isinstance(content.get(key), str) for key in ("command", "host", "since")):
             return content if isinstance(content.get("pid"), int) else None
     return None

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-
 from snarfcli.cli.command_list import COMMAND_LIST, Command
-from snarfcli.hydra_config.schema import describe, group_options, group_schemas, preset_groups
+from snarfcli.hydra_config.schema import group_options, preset_groups_among
+from snarfcli.hydra_config.source_schema import read_schema
 
 __all__ = ["command_help", "overview"]
 
@@ -24,15 +23,15 @@ def overview() -> str:
 
 def command_help(command: Command) -> str:
     """Return the help of one command: purpose, example, flags, choices and settings."""
-    schema = getattr(importlib.import_module(f"snarfcli.commands.{command.module}"), command.schema)
+    schema = read_schema(f"snarfcli.commands.{command.module}", command.schema)
     lines = [f"snarf {command.name}: {command.summary}", "", f"example: {command.example}"]
     lines += _section("flags", _flags(command))
-    choices = {name: name for name in group_schemas(schema)} | preset_groups(schema, command.name)
+    choices = {name: name for name in schema.groups} | preset_groups_among(schema.texts, command.name)
     options = {name: ", ".join(group_options(group)) for name, group in choices.items()}
     lines += _section("choices (GROUP=OPTION)", {name: several for name, several in options.items() if several})
-    lines += _section("settings (NAME=VALUE)", dict(describe(schema)))
-    for group, node in group_schemas(schema).items():
-        lines += _section(f"settings of {group} ({group}.NAME=VALUE)", dict(describe(node)))
+    lines += _section("settings (NAME=VALUE)", schema.settings())
+    for group, node in schema.groups.items():
+        lines += _section(f"settings of {group} ({group}.NAME=VALUE)", node.settings())
     return "\n".join(lines)
 
 

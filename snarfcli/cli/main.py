@@ -14,7 +14,13 @@ from snarfcli.cli.flags import translate_flags
 from snarfcli.cli.help import command_help, overview
 from snarfcli.cli.messages import user_message
 from snarfcli.cli.start import start_page
-from snarfcli.cli.terminal import abandon_output, output_failure, print_error, set_up_output
+from snarfcli.cli.terminal import (
+    abandon_output,
+    escape_what_cannot_be_shown,
+    output_failure,
+    print_error,
+    set_up_output,
+)
 from snarfcli.errors import UserError, nearest
 from snarfcli.hydra_config.home import expand_home
 from snarfcli.hydra_config.overrides import check_overrides, readable
@@ -43,6 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0, 1 (partly failed), 2 (user error), 130 (Ctrl-C), 143 (SIGTERM) or 129 (SIGHUP).
     """
     _open_standard_streams()
+    escape_what_cannot_be_shown()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments:
         return _print(start_page())
@@ -153,6 +160,7 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
     from omegaconf import OmegaConf
 
     from snarfcli.cli.multirun import NOTE_FOLDER, ExitCodes, lost_job, slot_of_job
+    from snarfcli.hydra_config.help_texts import lazy_help_texts
 
     codes = ExitCodes()
 
@@ -174,7 +182,8 @@ def _run_in_hydra(command: Command, run: Callable[[Any], int | None], overrides:
     before = sys.argv
     sys.argv = [f"snarf {command.name}", *_HYDRA_SETTINGS, NOTE_FOLDER, *overrides]
     try:
-        entry()
+        with lazy_help_texts():
+            entry()
     except Exception as error:
         if (lost := lost_job(error)) is not None:
             raise UserError(lost) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import os
 import sys
@@ -12,7 +13,14 @@ from types import TracebackType
 
 from snarfcli.texts import terminal_text
 
-__all__ = ["TerminalFormatter", "abandon_output", "output_failure", "print_error", "set_up_output"]
+__all__ = [
+    "TerminalFormatter",
+    "abandon_output",
+    "escape_what_cannot_be_shown",
+    "output_failure",
+    "print_error",
+    "set_up_output",
+]
 
 _LONGEST = 20_000  # characters of one log record; the longest table has 3,000
 
@@ -23,6 +31,16 @@ class TerminalFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         text = super().format(record)
         return terminal_text(text if len(text) <= _LONGEST else f"{text[:_LONGEST]}...")
+
+
+def escape_what_cannot_be_shown() -> None:
+    """Let standard output and error show characters that their encoding lacks as escapes, as on Windows' older code pages.
+
+    Otherwise printing them is an error, and a name in another alphabet would end a command or lose a line.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def set_up_output() -> None:

@@ -5,7 +5,6 @@ Imports of PyTorch and of rooms that need it stand inside functions: the report 
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
 import platform
@@ -19,11 +18,12 @@ from omegaconf import MISSING
 
 import snarfcli
 from snarfcli.commands.doctor_findings import Finding, promises
+from snarfcli.commands.doctor_tools import TOOLS, describe_error, package_finding, tools
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.errors import UserError
 from snarfcli.parallel import count_cores
-from snarfcli.texts import counted, one_line
-from snarfcli.versions import RECORDED_PACKAGES, installed_version
+from snarfcli.texts import counted
+from snarfcli.versions import RECORDED_PACKAGES
 
 __all__ = ["DoctorConfig", "Finding", "run"]
 
@@ -31,8 +31,6 @@ log = logging.getLogger(__name__)
 
 _SUBJECTS_CHECKED = 3  # of a data set; each takes some seconds
 _LISTED = 8  # names of data or runs on one line
-_TOOLS = {"embreex": "embreex.rtcore_scene", "libigl": "igl", "pymeshlab": "pymeshlab"}
-"""Compiled packages that are imported to see whether they work, and the module that shows it."""
 _OF_MOTIONS = {"up": "auto", "hands": "rest", "rest": "auto", "mapping": None, "clip": None}
 """Settings that need a motion file, and their defaults."""
 _OTHER_PACKAGES = ("scipy", "hydra-core", "tensorboard")
@@ -88,7 +86,7 @@ def run(config: DoctorConfig) -> int:
         "versions": _versions,
         "processor": _processor,
         "GPU": _gpu,
-        "tools": _tools,
+        "tools": tools,
         "data": lambda: _data(Path(config.data_root), Path(config.output_root)),
         "what is promised (docs/promises.md)": lambda: promises(Path(config.data_root), Path(config.output_root)),
     }
@@ -175,34 +173,17 @@ def _findings(examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     try:
         yield from examine()
     except Exception as error:  # anything can fail in a broken installation, which this command exists to explain
-        yield Finding("error", _describe_error(error), is_fallback=True)
-
-
-def _describe_error(error: Exception) -> str:
-    return f"{type(error).__name__}: {one_line(error)}"
+        yield Finding("error", describe_error(error), is_fallback=True)
 
 
 def _versions() -> Iterator[Finding]:
     yield Finding("snarf", f"{snarfcli.__version__}, {Path(snarfcli.__file__).parent}")
     yield Finding("python", f"{platform.python_version()}, {sys.executable}")
     yield Finding("platform", f"{platform.platform()}, {platform.machine()}")
-    yield _package("torch", "torch", "torch")
+    yield package_finding("torch", "torch", "torch")
     for package in (*RECORDED_PACKAGES, *_OTHER_PACKAGES):
-        if package not in ("snarf", "torch", *_TOOLS):
-            yield _package(package, package)
-
-
-def _package(name: str, package: str, module: str | None = None) -> Finding:
-    """Return the version of a package and, if `module` is given, whether that module can be imported."""
-    installed = installed_version(package)
-    if installed is None:
-        return Finding(name, f'not installed; run "pip install {package}"', is_fallback=True)
-    try:
-        if module is not None:
-            importlib.import_module(module)
-    except Exception as error:
-        return Finding(name, f"{package} {installed} cannot be imported: {_describe_error(error)}", is_fallback=True)
-    return Finding(name, f"{package} {installed}" if name != package else installed)
+        if package not in ("snarf", "torch", *TOOLS):
+            yield package_finding(package, package)
 
 
 def _processor() -> Iterator[Finding]:
@@ -246,23 +227,6 @@ def _gpu() -> Iterator[Finding]:
         yield Finding(f"cuda:{index}", f"{device.name}, {memory}, compute capability {device.major}.{device.minor}")
     status = cuda_status()
     yield Finding("CUDA kernels", status, is_fallback=count > 0 and "reference" in status)
-
-
-def _tools() -> Iterator[Finding]:
-    yield _ffmpeg()
-    for package, module in _TOOLS.items():
-        yield _package("embree" if package == "embreex" else package, package, module)
-
-
-def _ffmpeg() -> Finding:
-    """Return the ffmpeg that writes videos."""
-    try:
-        import imageio_ffmpeg
-
-        return Finding("ffmpeg", f"{imageio_ffmpeg.get_ffmpeg_version()}, {imageio_ffmpeg.get_ffmpeg_exe()}")
-    except Exception as error:
-        text = f'none ({_describe_error(error)}); videos cannot be written; run "pip install imageio-ffmpeg"'
-        return Finding("ffmpeg", text, is_fallback=True)
 
 
 def _data(data_root: Path, output_root: Path) -> Iterator[Finding]:

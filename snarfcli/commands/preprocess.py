@@ -40,6 +40,8 @@ class PreprocessConfig:
     """Sampling cube: its side exceeds the longest side of the mesh's bounding box by this share of that side."""
     inside_test: str = MISSING
     """Test for inside points: winding (points in overlapping parts are inside) or parity (outside, as in the papers' code)."""
+    poisson: str = MISSING
+    """What spreads points over the surface: pymeshlab (licence GPL-3), own, or auto for pymeshlab if it is installed."""
     workers: int = MISSING
     """Number of worker processes; 0 for one per core."""
     seed: int = MISSING
@@ -67,7 +69,7 @@ def run(config: PreprocessConfig) -> None:
     from snarfcli.datasets.sources import Request
     from snarfcli.parallel import count_cores
     from snarfcli.samples.preprocessing import preprocess_subject
-    from snarfcli.sampling import SamplingSettings
+    from snarfcli.sampling import SamplingSettings, choose_poisson
 
     dataset = find_dataset(config.data.name)
     sampling = SamplingSettings(
@@ -76,6 +78,7 @@ def run(config: PreprocessConfig) -> None:
         padding=config.padding,
         inside_test=config.inside_test,
         seed=config.seed,
+        poisson=choose_poisson(config.poisson),
     )
     frame_steps = {
         "train": config.data.frame_step,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
+from snarfcli.errors import UserError
 from snarfcli.sampling import winding_numbers
 from snarfcli.sampling.occupancy import count_boundary_edges
 
@@ -156,8 +157,18 @@ def _ramp(x: NDArray, start: float, end: float) -> NDArray:
 
 
 def _union(one: tuple[NDArray, NDArray], other: tuple[NDArray, NDArray]) -> tuple[NDArray, NDArray]:
-    """Return the outer surface of two closed meshes."""
-    import pymeshlab  # here, since it takes a second to import
+    """Return the outer surface of two closed meshes.
+
+    Raises:
+        UserError: MeshLab is not installed.
+    """
+    try:
+        import pymeshlab  # here, since it takes a second to import
+    except ModuleNotFoundError:
+        raise UserError(
+            "data=clothed joins body and garment with MeshLab, but pymeshlab is not installed; install it with: "
+            "pip install pymeshlab (licence GPL-3)"
+        ) from None
 
     meshes = pymeshlab.MeshSet(verbose=False)  # pyright: ignore[reportAttributeAccessIssue]  # its stub lists no classes
     for vertices, faces in (one, other):

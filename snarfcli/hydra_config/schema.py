@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from snarfcli.field_docs import field_texts
@@ -19,6 +19,7 @@ __all__ = [
     "group_schemas",
     "list_settings",
     "preset_groups",
+    "preset_groups_among",
     "register_schemas",
     "setting_names",
 ]
@@ -32,11 +33,16 @@ def config_folder() -> Path:
 
 
 def preset_groups(schema: type, command: str) -> dict[str, str]:
-    """Return the fields of a command's dataclass that choose a preset, with the configuration group of each.
+    """Return the fields of a command's dataclass that choose a preset, with the configuration group of each."""
+    return preset_groups_among([field.name for field in dataclasses.fields(schema)], command)
+
+
+def preset_groups_among(names: Iterable[str], command: str) -> dict[str, str]:
+    """Return those of a command's fields that choose a preset, with the configuration group of each.
 
     The group is the folder `<field>/<command>` in conf/, such as experiment/train.
     """
-    groups = {field.name: f"{field.name}/{command}" for field in dataclasses.fields(schema)}
+    groups = {name: f"{name}/{command}" for name in names}
     return {name: group for name, group in groups.items() if (config_folder() / group).is_dir()}
 
 

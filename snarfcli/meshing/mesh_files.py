@@ -66,7 +66,7 @@ def write_obj(path: str | Path, mesh: Mesh) -> None:
         np.savetxt(text, mesh.normals, fmt="vn %.5f %.5f %.5f")
         np.savetxt(text, faces.repeat(2, axis=1), fmt="f %d//%d %d//%d %d//%d")
     with atomic_path(path, flush_name=False) as temporary:
-        temporary.write_text(text.getvalue())
+        temporary.write_bytes(text.getvalue().encode())
 
 
 MESH_WRITERS: dict[str, Callable[[str | Path, Mesh], None]] = {"ply": write_ply, "obj": write_obj}

@@ -1,4 +1,4 @@
-"""Light on a mesh, by ray casting with Embree: a dome, a key light and their soft shadows."""
+"""Light on a mesh, by ray casting: a dome, a key light and their soft shadows."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from snarfcli.meshing.mesh import Mesh, vertex_normals
 from snarfcli.rendering.camera import Camera
+from snarfcli.sampling.rays import NO_HIT, FirstHits, ray_mesh
 
 __all__ = ["PATTERN", "LitScene", "Look", "Solid", "dot"]
 
@@ -42,28 +43,24 @@ class Look:
 
 
 class Solid:
-    """A mesh in Embree, for any number of pictures."""
+    """A mesh prepared for rays, for any number of pictures."""
 
     def __init__(self, mesh: Mesh) -> None:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
         self.mesh = mesh
         self.normals = vertex_normals(mesh.vertices, mesh.faces) if mesh.normals is None else mesh.normals
-        # Coordinates near the origin, where Embree's float32 is precise.
+        # Coordinates near the origin, where the float32 of the rays is precise.
         self.origin = ((mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2).astype(np.float32)
-        self.scene = EmbreeScene()
-        self.geometry = TriangleMesh(self.scene, mesh.vertices - self.origin, mesh.faces)
+        self.rays = ray_mesh(mesh.vertices - self.origin, mesh.faces)
 
     def distances(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the length of each ray [N, 3] up to its first hit, metres; above 1e6 if it hits nothing."""
+        """Return the length of each ray [N, 3] up to its first hit, metres; above `NO_HIT` if it hits nothing."""
         origins = np.ascontiguousarray(points - self.origin, dtype=np.float32)
-        return self.scene.run(origins, np.ascontiguousarray(directions, dtype=np.float32), query="DISTANCE")
+        return self.rays.distances(origins, np.ascontiguousarray(directions, dtype=np.float32))
 
-    def first_hits(self, eye: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the first hits of rays [N, 3] from one point: `primID` [N] (-1 for none), `u` and `v` [N]."""
+    def first_hits(self, eye: np.ndarray, directions: np.ndarray) -> FirstHits:
+        """Return the first hits of rays [N, 3] from one point."""
         origins = np.broadcast_to((eye - self.origin).astype(np.float32), directions.shape)
-        return self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
+        return self.rays.first_hits(np.ascontiguousarray(origins), np.ascontiguousarray(directions))
 
 
 class LitScene:
@@ -114,7 +111,7 @@ class LitScene:
 
         across = np.concatenate(_frames(self.key[None]))
         rays = (self.key + look.key_radius * _spiral(look.key_rays) @ across).astype(np.float32)[phase].reshape(-1, 3)
-        clear = self.solid.distances(start.repeat(look.key_rays, axis=0), rays) > 1e6
+        clear = self.solid.distances(start.repeat(look.key_rays, axis=0), rays) > NO_HIT
         return dome, clear.reshape(count, look.key_rays).mean(axis=1)
 
 

@@ -1,10 +1,10 @@
-"""Pictures of meshes by ray casting with Embree: no display, no OpenGL.
+"""Pictures of meshes by ray casting: no display, no OpenGL.
 
 DESIGN. Primary rays are cast only inside the bounding box of the mesh on the screen, `supersample` squared per pixel. Light
 comes from a sky dome and a large key light, both tested for occlusion with a few rays per pixel; neighbouring pixels use
 different directions and a small blur averages them, so that 12 rays look like a hundred. Constant parts are kept from picture
 to picture: a `Solid` serves several cameras, a `Backdrop` all pictures of a fixed camera. A body at 512 x 512 takes a fifth of
-a second of one core (benchmarks/bm_video.py).
+a second of one core with Embree (benchmarks/bm_video.py), and four times as long without it.
 """
 
 from __future__ import annotations
@@ -86,10 +86,10 @@ def _draw(scene: LitScene, width: int, height: int, supersample: int) -> tuple[n
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
     view = camera.rays((columns + 0.5) / supersample, (rows + 0.5) / supersample, width, height)
     hits = solid.first_hits(np.asarray(camera.position), view)
-    seen = np.flatnonzero(hits["primID"] >= 0)
+    seen = np.flatnonzero(hits.triangle >= 0)
     sample_x, sample_y, view = columns[seen % len(columns)], rows[seen // len(columns)], view[seen]
-    corner = mesh.faces[hits["primID"][seen]]
-    u, v = hits["u"][seen, None], hits["v"][seen, None]
+    corner = mesh.faces[hits.triangle[seen]]
+    u, v = hits.u[seen, None], hits.v[seen, None]
     share = np.concatenate([1 - u - v, u, v], axis=1).astype(np.float32)
 
     def blend(attribute: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ def write_report(
     name = plan.experiment.name
     table = folder / f"{name}.csv"
     with atomic_path(table) as temporary:
-        temporary.write_text(csv_table(plan, results, link))
+        temporary.write_bytes(csv_table(plan, results, link).encode())
     figures = [] if figure_resolution is None else draw_figures(plan, results, folder / "figures", figure_resolution)
     text = folder / f"{name}.md"
     sections = [
@@ -67,7 +67,7 @@ def write_report(
         *provenance_sections(results),
     ]
     with atomic_path(text) as temporary:
-        temporary.write_text("\n\n".join(section for section in sections if section) + "\n")
+        temporary.write_bytes(("\n\n".join(section for section in sections if section) + "\n").encode())
     return [text, table, *(path for path, _ in figures)]
 
 

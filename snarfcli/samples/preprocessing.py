@@ -27,7 +27,7 @@ from snarfcli.samples.writing import (
     require_same_settings,
     write_manifest,
 )
-from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, sample_frames
+from snarfcli.sampling import BrokenFrame, SamplingSettings, check_frames, recorded_settings, sample_frames
 from snarfcli.texts import counted
 from snarfcli.versions import recorded_versions
 
@@ -86,8 +86,7 @@ def preprocess_subject(
     settings = {
         "data": subject.data,
         "subject": subject.subject,
-        # written for planar subjects only, so that other subjects keep the settings of their existing samples
-        **{name: value for name, value in vars(sampling).items() if name != "is_planar" or value},
+        **recorded_settings(sampling),
         **{f"{split}_frame_step": step for split, step in frame_steps.items()},
     }
     folder = samples_folder(root, subject.data, subject.subject)

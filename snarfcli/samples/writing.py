@@ -199,7 +199,9 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any]) -> None:
         before = before if isinstance(before, dict) else {}
         names = [name for name in {**settings, **before} if settings.get(name) != before.get(name)]
         if names:
-            changes = ", ".join(f"{name} {str(before.get(name))[:60]} -> {settings.get(name)}" for name in names[:9])
+            changes = ", ".join(
+                f"{name} {str(before.get(name, 'unset'))[:60]} -> {settings.get(name, 'unset')}" for name in names[:9]
+            )
             raise UserError(
                 f"the samples in {folder} were made with other settings ({one_line(changes, 400)}); "
                 "keep those settings, or start again with overwrite=true"

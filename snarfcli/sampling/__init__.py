@@ -19,20 +19,29 @@ from snarfcli.sampling.points import (
     SamplingSettings,
     check_frames,
     frame_generator,
+    recorded_settings,
     sample_frame,
     sample_frames,
 )
-from snarfcli.sampling.surface import oriented_surface_samples, surface_samples, uniform_surface_samples
+from snarfcli.sampling.surface import (
+    POISSON,
+    choose_poisson,
+    oriented_surface_samples,
+    surface_samples,
+    uniform_surface_samples,
+)
 
 __all__ = [
     "CUBE_PADDING",
     "INSIDE_TESTS",
+    "POISSON",
     "BrokenFrame",
     "FrameSamples",
     "MeshSequence",
     "SamplingSettings",
     "check_frames",
     "check_mesh",
+    "choose_poisson",
     "count_boundary_edges",
     "dequantise",
     "frame_generator",
@@ -44,6 +53,7 @@ __all__ = [
     "pack_vertices",
     "quantise",
     "ray_parity",
+    "recorded_settings",
     "sample_frame",
     "sample_frames",
     "sampling_cube",

@@ -6,6 +6,7 @@ import igl
 import numpy as np
 
 from snarfcli.errors import UserError
+from snarfcli.sampling.rays import count_crossings
 
 __all__ = [
     "INSIDE_TESTS",
@@ -103,9 +104,7 @@ def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray)
         return np.zeros(0)
     vertices, points = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(points, np.float64)
     faces = np.ascontiguousarray(faces, np.int64)
-    # libigl 2.5 has another name for it
-    fast = getattr(igl, "fast_winding_number_for_meshes", None) or igl.fast_winding_number
-    numbers = np.array(fast(vertices, faces, points), np.float64).reshape(-1)
+    numbers = np.array(igl.fast_winding_number(vertices, faces, points), np.float64).reshape(-1)
     unsure = np.abs(numbers - np.rint(numbers)) > _INTEGER_TOLERANCE
     if unsure.any():
         numbers[unsure] = np.asarray(igl.winding_number(vertices, faces, points[unsure])).reshape(-1)
@@ -122,16 +121,12 @@ def ray_parity(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> n
         faces: [F, 3], vertex indices.
         points: [N, 3], metres.
     """
-    import trimesh  # here: loading it takes a second, and winding numbers do not need it
-
     if len(points) == 0:
         return np.zeros(0, bool)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
     points = np.asarray(points, np.float64)
     votes = np.zeros(len(points), np.int64)
     for direction in _RAY_DIRECTIONS:  # a ray through an edge may count twice or not at all, but hardly two of three
-        rays = mesh.ray.intersects_id(points, np.broadcast_to(direction, points.shape), multiple_hits=True)[1]
-        votes += np.bincount(rays, minlength=len(points)) % 2
+        votes += count_crossings(vertices, faces, points, np.array(direction)) % 2
     return votes >= 2
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from snarfcli.sampling.occupancy import (
     winding_numbers,
 )
 from snarfcli.sampling.planar import in_turned_over, outline_samples, with_plane_on_cells
-from snarfcli.sampling.surface import surface_samples
+from snarfcli.sampling.surface import POISSON, surface_samples
 
 __all__ = [
     "BrokenFrame",
@@ -29,6 +29,7 @@ __all__ = [
     "SamplingSettings",
     "check_frames",
     "frame_generator",
+    "recorded_settings",
     "sample_frame",
     "sample_frames",
 ]
@@ -48,6 +49,8 @@ class SamplingSettings:
     """`winding` or `parity`, see `INSIDE_TESTS`."""
     seed: int
     """Seed of all random numbers."""
+    poisson: str = "pymeshlab"
+    """One of `POISSON`: what spreads points over the surface."""
     is_planar: bool = False
     """Whether the subject is two-dimensional: a prism, sampled only on the plane z = 0 and near its outline there."""
 
@@ -63,6 +66,16 @@ class SamplingSettings:
                 f"inside_test: wanted {' or '.join(INSIDE_TESTS)}, got {self.inside_test}"
                 f"{nearest(self.inside_test, INSIDE_TESTS)}"
             )
+        if self.poisson not in POISSON:
+            raise UserError(f"poisson: wanted {' or '.join(POISSON)}, got {self.poisson}{nearest(self.poisson, POISSON)}")
+
+
+def recorded_settings(settings: SamplingSettings) -> dict[str, Any]:
+    """Return the settings to record with samples, by name.
+
+    Those that have a default are left out with it: they are newer than the others, and existing samples do not have them.
+    """
+    return {field.name: value for field in fields(settings) if (value := getattr(settings, field.name)) != field.default}
 
 
 @dataclass(frozen=True)
@@ -140,8 +153,10 @@ def sample_frame(
     if settings.is_planar:
         cube_lower = with_plane_on_cells(cube_lower, cube_size, CUBE_LEVELS)
     uniform = cube_lower + generator.random((count // 2, 3)) * cube_size
-    spread = outline_samples if settings.is_planar else surface_samples
-    near = spread(vertices, faces, count - count // 2, generator)
+    if settings.is_planar:
+        near = outline_samples(vertices, faces, count - count // 2, generator)
+    else:
+        near = surface_samples(vertices, faces, count - count // 2, generator, settings.poisson)
     near = near + generator.normal(scale=settings.surface_noise_m, size=near.shape)
     chosen = np.concatenate([uniform, near])
     if settings.is_planar:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["area_normals", "random_points_in"]
+__all__ = ["area_normals", "random_points_in", "uniform_in_triangles"]
 
 
 def area_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -29,3 +29,10 @@ def random_points_in(corners: NDArray[np.float64], generator: np.random.Generato
     root = np.sqrt(first)
     a, b, c = corners.transpose(1, 0, 2)
     return (1 - root) * a + root * (1 - second) * b + root * second * c
+
+
+def uniform_in_triangles(
+    corners: NDArray[np.float64], areas: NDArray[np.float64], count: int, generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return `count` independent points [count, 3], uniform on triangles with `corners` [F, 3, 3] and `areas` [F]."""
+    return random_points_in(corners[generator.choice(len(areas), count, p=areas / areas.sum())], generator)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import subprocess
 import sys
 import warnings
+
+import pytest
 
 from snarfcli import progress
 from snarfcli.cli import main as cli
@@ -73,3 +76,21 @@ def test_a_message_has_bounded_length():
     assert message.endswith("...")
     assert message.isprintable()
     assert user_message(OSError(28, "full", "x" * 5000)).endswith("...")  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
+def test_characters_that_the_terminal_lacks_are_escaped(tmp_path, encoding):
+    """As with the code pages of Windows, or without a locale."""
+    code = (
+        "import logging; from snarfcli.cli import main as cli; from snarfcli.commands import doctor; "
+        "doctor.run = lambda config: doctor.log.info('reading %s', config.data_root); "
+        "raise SystemExit(cli.main(['doctor', 'data_root=größe_漢']) or cli.main(['doctor', 'größe_漢=1']))"
+    )
+    environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True)
+    name = b"gr\xf6\xdfe_\\u6f22" if encoding == "cp1252" else b"gr\\xf6\\xdfe_\\u6f22"
+    assert done.stdout.splitlines() == [b"reading " + name]
+    assert done.stderr.startswith(b"snarf doctor: ")
+    assert b"Traceback" not in done.stderr
+    assert name in done.stderr
+    assert done.returncode == 2

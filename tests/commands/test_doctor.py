@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 from fake_gpus import FakeDriver, install_gpus
 
 from snarfcli.cli import main as cli
-from snarfcli.commands import doctor
+from snarfcli.commands import doctor, doctor_tools
 from snarfcli.commands.doctor import DoctorConfig
 from snarfcli.native import cuda_compile, library
 
@@ -35,7 +36,7 @@ def test_everything_is_told(caplog, tmp_path):
     import torch
 
     lines = report(caplog, tmp_path / "data", tmp_path / "outputs")
-    assert lines["torch"] == torch.__version__
+    assert lines["torch"] == version("torch")  # torch.__version__ may have more, such as +cu124
     assert lines["threads"].startswith(f"{torch.get_num_threads()} ")
     assert lines["native library"].startswith(f"active, {library.instruction_set()}, {library.library_path()}")
     assert "no folder" in lines["data_root"]
@@ -43,6 +44,25 @@ def test_everything_is_told(caplog, tmp_path):
     assert "snarf train" in lines["avatars"]
     others = {"snarf", "python", "platform", "numpy", "model", "devices", "CUDA kernels", "ffmpeg", "embree", "libigl"}
     assert others <= set(lines)
+    assert "licence GPL-3" in lines["pymeshlab"]
+
+
+@pytest.mark.parametrize(
+    ("package", "name", "told"),
+    [
+        ("embreex", "embree", "libigl traces the rays, several times slower; there are no wheels for Linux on ARM"),
+        ("pymeshlab", "pymeshlab", "poisson=own) and libigl decimates; data=clothed needs it"),
+        ("scipy", "scipy", "not installed"),
+    ],
+)
+def test_what_stands_in_for_a_missing_package_is_named(caplog, tmp_path, monkeypatch, package, name, told):
+    there = doctor_tools.installed_version
+    monkeypatch.setattr(doctor_tools, "installed_version", lambda one: None if one == package else there(one))
+    lines = report(caplog, tmp_path, tmp_path)
+    assert lines[name].startswith("not installed")
+    assert told in lines[name]
+    assert lines[name].endswith(f'; run "pip install {package}"')
+    assert name in lines["end"]
 
 
 def test_data_and_avatars_are_found(caplog, tmp_path):

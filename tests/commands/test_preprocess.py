@@ -46,8 +46,8 @@ def subject(monkeypatch: pytest.MonkeyPatch) -> list[SubjectData]:
 def _config(root: Path, **changes: Any) -> PreprocessConfig:
     return PreprocessConfig(**{
         "subject": "toy", "data": DataConfig("builtin", 1, 1, 1), "data_root": str(root), "points_per_frame": 400,
-        "surface_noise_m": 0.01, "padding": 0.1, "inside_test": "winding", "workers": 1, "seed": 0, "overwrite": False,
-        "sequences": [], "skip_broken": False, "body": None, **changes,
+        "surface_noise_m": 0.01, "padding": 0.1, "inside_test": "winding", "poisson": "auto", "workers": 1, "seed": 0,
+        "overwrite": False, "sequences": [], "skip_broken": False, "body": None, **changes,
     })  # fmt: skip
 
 
@@ -104,6 +104,8 @@ def test_settings_are_not_mixed(tmp_path: Path, subject: list[SubjectData]) -> N
     before = _contents(tmp_path)
     with pytest.raises(UserError, match=r"other settings \(padding 0.1 -> 0.3, seed 0 -> 5\).*overwrite=true"):
         preprocess.run(_config(tmp_path, seed=5, padding=0.3, **few))
+    with pytest.raises(UserError, match=r"other settings \(poisson unset -> own\)"):
+        preprocess.run(_config(tmp_path, poisson="own", **few))
     with pytest.raises(UserError, match="train_frame_step 1 -> 2"):
         preprocess.run(_config(tmp_path, data=DataConfig("builtin", 2, 1, 1), **few))
     subject[0] = toy_subject()

@@ -256,7 +256,7 @@ def test_an_unfinished_sequence_leaves_nothing(tmp_path: Path) -> None:
 def test_other_settings_are_named(folder: Path) -> None:
     require_same_settings(folder, _SETTINGS)
     for _ in range(2):  # by the manifest, then by the sequences of an unfinished run
-        with pytest.raises(UserError, match=r"other settings \(seed 0 -> 1, padding None -> 0.2\).*overwrite=true"):
+        with pytest.raises(UserError, match=r"other settings \(seed 0 -> 1, padding unset -> 0.2\).*overwrite=true"):
             require_same_settings(folder, {**_SETTINGS, "seed": 1, "padding": 0.2})
         (folder / "manifest.json").unlink(missing_ok=True)
 

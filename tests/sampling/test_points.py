@@ -12,6 +12,7 @@ from toy_subject import capsule_mesh, crossing_capsules, mesh_volume
 
 from snarfcli.errors import UserError
 from snarfcli.sampling import (
+    POISSON,
     BrokenFrame,
     SamplingSettings,
     check_frames,
@@ -50,10 +51,11 @@ def test_quantisation_keeps_points_within_half_a_step() -> None:
     np.testing.assert_array_equal(quantise(outside, lower, size), [[0, 65535, 65535], [0, 0, 0]])
 
 
+@pytest.mark.parametrize("poisson", POISSON)
 @pytest.mark.parametrize("count", [5, 3000])
-def test_surface_samples_lie_evenly_on_the_surface(count: int) -> None:
+def test_surface_samples_lie_evenly_on_the_surface(count: int, poisson: str) -> None:
     vertices, faces = capsule_mesh(0.0, 0.5, around=48, cap=12)
-    points = surface_samples(vertices, faces, count, np.random.default_rng(1))
+    points = surface_samples(vertices, faces, count, np.random.default_rng(1), poisson)
     assert points.shape == (count, 3)
     radius = np.linalg.norm(points, axis=1)
     assert radius.max() <= 0.5 + 1e-6

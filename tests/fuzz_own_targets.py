@@ -575,6 +575,7 @@ def mesh_obj() -> Target:
     return _mesh_target("mesh_obj", ".obj")
 
 
-OWN_TARGETS = (avatar, avatar_use, safetensors, pretrained, checkpoint, samples, resumed_samples, refined_poses, fitted_skeleton,
-               fitted_poses, fit_report, animation_record, planned_job, job_status, durations, metrics, mesh_ply, mesh_obj)  # fmt: skip
+OWN_TARGETS = (avatar, avatar_use, safetensors, pretrained, checkpoint, samples, resumed_samples, refined_poses,
+               fitted_skeleton, fitted_poses, fit_report, animation_record, planned_job, job_status, durations, metrics,
+               mesh_ply, mesh_obj)  # fmt: skip
 """Functions that each return one target with the name of the function."""

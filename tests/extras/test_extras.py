@@ -87,7 +87,7 @@ for path in sorted(folder.rglob("*.py")):
         "rendering",
         "reproduce",
     }
-    assert set(done.stdout.split()) == rooms | {"extras", "samples", "sampling", "training", "viewer"}
+    assert set(done.stdout.split()) == rooms | {"extras", "point_clouds", "samples", "sampling", "training", "viewer"}
 
 
 def test_public_names_say_what_to_install():

@@ -65,8 +65,8 @@ _API_START = """# API reference
 
 Made from the docstrings. The package is called `snarf` as well as `snarfcli`; both names give the same modules and objects.
 What is used most can be imported from `snarf` itself: `Avatar`, `Body`, `Skeleton`, `builtin_body`, `load_body`,
-`ForwardDeformer`, `CanonicalGrid`, `Correspondences`, `PresetWeights`, `SearchConfig`, `SkinningConfig`, `find_correspondences`,
-`find_correspondences_on_field`, `find_correspondences_on_map`, `skin` and `UserError`.
+`ForwardDeformer`, `CanonicalGrid`, `Correspondences`, `PresetWeights`, `SearchConfig`, `SkinningConfig`,
+`find_correspondences`, `find_correspondences_on_field`, `find_correspondences_on_map`, `skin` and `UserError`.
 
 Lengths are in metres, angles in radians. Shapes of arrays are in square brackets: `B` batch, `N` points, `J` joints, `M` roots,
 `V` vertices, `F` faces, `D H W` nodes of a grid.

@@ -25,7 +25,9 @@ def test_it_is_stored_without_results():
 def test_it_runs_from_top_to_bottom(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    names = run_notebook(NOTEBOOK, {"training": "smoke", "samples": LESS, "resolution": 48})
+    names = run_notebook(
+        NOTEBOOK, {"training": "smoke", "samples": LESS, "measures": "figure_frames=1 figure_resolution=48", "resolution": 48}
+    )
     run = tmp_path / "first_avatar/outputs/builtin/50002/first"
     assert {"avatar.pt", "eval_id", "eval_ood", "character.glb", "character.html"} <= {path.name for path in run.iterdir()}
     assert 0.02 < float((names["occupancy"] > 0.5).float().mean()) < 0.6

@@ -207,8 +207,9 @@ def _whole(
     fitted: FittedSequence, facts: Sequence[ScanFacts], usable: Sequence[int], source: str, seconds: float
 ) -> FittedFile:
     """Return the poses of all frames of a sequence; those that cannot be read have the pose of the nearest one."""
-    nearest = np.abs(np.arange(len(facts))[:, None] - np.array(usable)).argmin(1)
-    is_read = np.isin(np.arange(len(facts)), usable)
+    frames = np.arange(len(facts))
+    nearest = np.searchsorted((np.array(usable[1:]) + np.array(usable[:-1])) / 2, frames)  # the earlier one of two
+    is_read = np.isin(frames, usable)
     reasons = [one_line(one.problem or fitted.reasons[nearest[frame]], LONGEST_REASON) for frame, one in enumerate(facts)]
     return FittedFile(
         fitted.poses[nearest],

@@ -147,7 +147,7 @@ def _floors(samples: Sequence[Sample], seen: Sequence[Floor | None]) -> dict[int
 def _scale(length: float, body_m: float | None, wanted: str) -> tuple[float, str]:
     """Return the metres per unit, and the reason as text; `length` is that of the subject, units of the files."""
     if wanted != "auto":
-        return float(wanted), f"scaled by {float(wanted):g} (data.scale): {float(wanted) * length:.2f} m long"
+        return float(wanted), f"one unit of the files is {float(wanted):g} m: {float(wanted) * length:.2f} m long"
     if body_m is None:
         return person_scale(length, length, wanted, None)
     low, high = (share * body_m for share in _LENGTHS)

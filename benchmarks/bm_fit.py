@@ -47,6 +47,7 @@ _CLOTHES_M = 0.03
 _NOISE_M, _NORMAL_NOISE = 0.005, 0.2
 _FLOOR_POINTS, _FLOOR_M = 1000, 1.0
 _UNSEEN = 0.3  # share of the points, those that face most to one side
+_SINGLE_STEP = 20  # frames of a sequence, whose 6 or 12 frames are then fitted one by one in 2.5 s each
 _OTHER_SHAPES = ("50102", "50104")
 _ROWS = ("naked", "single", "clothed", "noise", "missing", "floor", "shapes", "real", "topology")
 _LOST_SHARE, _LOST_MM = 0.2, 50.0
@@ -113,7 +114,8 @@ def _of_subject(subject: str, motion: str, row: str) -> Sequence:
     """Return a sequence of a built-in subject at 30 frames per second."""
     data = _subject(subject, row == "clothed")
     spec = next(spec for spec in data.sequences if spec.name == motion)
-    frames = np.arange(0, spec.motion.num_frames, round(spec.motion.frame_rate / _FRAME_RATE))
+    step = round(spec.motion.frame_rate / _FRAME_RATE) * (_SINGLE_STEP if row == "single" else 1)
+    frames = np.arange(0, spec.motion.num_frames, step)
     poses, translation = spec.motion.poses[frames], spec.motion.translation[frames]
     return Sequence(_body(None), np.asarray(data.betas), poses, translation, lambda index: spec.meshes[int(frames[index])])
 

@@ -82,7 +82,7 @@ def close_surface(points: Array, normals: Array) -> tuple[Array, NDArray[np.int6
         ValueError: there are fewer than 16 points, one is not finite, they enclose nothing, or the normals point inward.
     """
     points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
-    areas = point_areas(points)
+    areas = point_areas(points)  # squared units of the points; relative to cells below, so that float32 holds them
     spacing = float(np.sqrt(np.median(areas)))
     if not spacing > 0:
         raise ValueError("points: wanted different points, got most of them twice")
@@ -90,7 +90,7 @@ def close_surface(points: Array, normals: Array) -> tuple[Array, NDArray[np.int6
     places = lattice.places(points)
     field = _indicator(lattice, places, normals * areas[:, None] / lattice.cell**2)
     field -= np.average(map_coordinates(field, places.T, order=1), weights=areas)
-    field -= _around_points(lattice, places, map_coordinates(field, places.T, order=1), areas)
+    field -= _around_points(lattice, places, map_coordinates(field, places.T, order=1), areas / lattice.cell**2)
     return _surface(lattice, field)
 
 

@@ -36,6 +36,7 @@ _MAX_POINTS = 2_000_000
 _MAX_ARRAY_BYTES = 2**28
 _POINT_NAMES = ("points", "vertices", "xyz", "positions")
 _NORMAL_NAMES = ("normals", "normal")
+_DIRECTION = np.array([0.5377, 0.3141, 0.7825])  # along which different points hardly ever have equal coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ class PointFile:
     """The points of a file, in its units and axes."""
 
     points: NDArray[np.float64]
-    """[P, 3], P > 0, finite."""
+    """[P, 3], P > 0, finite, all different, in the order of the file."""
     normals: NDArray[np.float64] | None
     """[P, 3], as in the file, of any length and side; None if it has none."""
 
@@ -79,6 +80,7 @@ def read_points(path: str | Path) -> PointFile:
 
     Normals are nx, ny and nz of a PLY file, as many `vn` as `v` lines of an OBJ file, three columns of unit length in a text
     or an array `.npy`, and an array `normals` in an `.npz`, whose points are called points, vertices, xyz or positions.
+    Of points that occur several times, such as the corners of separate triangles, the first is kept.
 
     Raises:
         UserError: the file is missing, damaged, too large, of an unknown format, or has no points.
@@ -171,4 +173,14 @@ def _checked_points(path: Path, points: NDArray, normals: NDArray | None) -> Poi
     bad = np.count_nonzero(~np.isfinite(points).all(axis=1))
     if bad:
         raise UserError(f"{path}: {bad} of its {len(points)} points are NaN or infinite; remove them or export it again")
-    return PointFile(points, normals)
+    kept = _first_of_equal(points)
+    return PointFile(points[kept], None if normals is None else normals[kept])
+
+
+def _first_of_equal(points: NDArray[np.float64]) -> slice | NDArray[np.intp]:
+    """Return which points [P, 3] to keep, so that each place occurs once."""
+    with np.errstate(all="ignore"):
+        along = np.diff(np.sort(points @ _DIRECTION))
+    if along.all():  # faster than comparing all coordinates, which few files need
+        return slice(None)
+    return np.sort(np.unique(points, axis=0, return_index=True)[1])

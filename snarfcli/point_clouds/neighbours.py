@@ -11,7 +11,7 @@ __all__ = ["LEAST_POINTS", "find_neighbours", "plane_normals", "point_areas"]
 Array = NDArray[np.float64]
 
 LEAST_POINTS = 16
-"""Fewest points of a cloud."""
+"""Minimum number of points of a cloud."""
 
 _AREA_NEIGHBOURS = 8
 

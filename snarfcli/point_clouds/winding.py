@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 _PROBES = 1200  # points at which winding numbers are measured
 _SOURCES = 6000  # points that they are made from
+_LEAST = 1e-100  # instead of 0 below a fraction
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,8 @@ class WindingProbes:
         """Choose probes and sources by chance, always the same; areas [N] are those of the points [N, 3]."""
         order = np.random.default_rng(0).permutation(len(points))
         sources = order[:_SOURCES]
-        return cls(points, areas * (areas.sum() / areas[sources].sum()), order[:_PROBES], sources)
+        share = areas[sources].sum() / max(areas.sum(), _LEAST)
+        return cls(points, areas / max(share, _LEAST), order[:_PROBES], sources)
 
     def misfit(self, normals: Array) -> float:
         """Return how far the winding numbers of normals [N, 3] are from one half, from 0 to about 1 where all point inward."""
@@ -57,6 +59,7 @@ class WindingProbes:
         squared = np.square(at).sum(axis=1)[:, None] + np.square(source).sum(axis=1) - 2 * at @ source.T
         # A point alone stands for a disk, whose dipole is not infinite at its middle.
         squared = np.maximum(squared, 0.0) + self.areas[self.sources] / np.pi
+        squared = np.maximum(squared, _LEAST)  # a point that occurs many times has no area
         solid = ((source * weighted).sum(axis=1) - at @ weighted.T) / (4 * np.pi * squared * np.sqrt(squared))
         added = np.zeros((groups.max() + 1, len(at)))
         np.add.at(added, groups[self.sources], solid.T)

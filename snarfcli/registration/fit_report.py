@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from snarfcli.datasets.checking import Remark
 from snarfcli.datasets.sources import Request
@@ -71,10 +72,7 @@ class SequenceReport:
         """The entry of the report."""
         fitted = self.fitted
         mean, most = self.residual_mm()
-        limits: dict[str, list[int]] = {}
-        for frame, pose in enumerate(fitted.poses):
-            for joint in near_limits(self.joint_names, pose):
-                limits.setdefault(joint, []).append(frame)
+        limits = near_limits(self.joint_names, fitted.poses)
         reasons: dict[str, list[int]] = {}
         for frame in np.flatnonzero(~fitted.is_trusted).tolist():
             reasons.setdefault(fitted.reasons[frame], []).append(frame)
@@ -160,7 +158,7 @@ def _remarks(content: Any) -> Iterator[Remark]:
         yield Remark("fit", f"and {counted(len(content['sequences']) - _LISTED, 'more sequence')}; see {REPORT}")
 
 
-def _runs(frames: Sequence[int]) -> str:
+def _runs(frames: Sequence[int] | NDArray[np.intp]) -> str:
     """Return ascending numbers as text: 3-17, 20."""
     numbers = np.asarray(frames)
     parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)

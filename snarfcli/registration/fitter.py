@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.bodies import Body, Skeleton, builtin_body, find_body, load_body
+from snarfcli.files import file_digest
 from snarfcli.registration.body_surface import BodyState, BodySurface
 from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.rigs import RigSurface, read_rig
@@ -53,6 +54,8 @@ class Fitter(ABC):
     """[F, 3], of all vertices."""
     library: PoseLibrary
     """Poses from which searches start."""
+    digest: str
+    """Tells whether a body of files is still the same; empty for the built-in body."""
 
     @cached_property
     def prior(self) -> PosePrior:
@@ -87,9 +90,9 @@ class Fitter(ABC):
 class BodyFitter(Fitter):
     """A body in SMPL's format."""
 
-    def __init__(self, body: Body, source: str) -> None:
+    def __init__(self, body: Body, source: str, digest: str) -> None:
         """Prepare a body; `source` says where it is from."""
-        self.body, self.source = body, source
+        self.body, self.source, self.digest = body, source, digest
         has_shapes = body.num_betas > 0 and bool(body.shapedirs.abs().max() > 0)
         self.surface = BodySurface.from_body(body, _VERTICES, betas=min(_BETAS, body.num_betas) if has_shapes else 0)
         self.faces = body.faces.numpy()
@@ -119,7 +122,7 @@ class RigFitter(Fitter):
 
     def __init__(self, rig: RigSurface) -> None:
         """Prepare a rig, in metres."""
-        self.rig, self.source = rig, rig.source
+        self.rig, self.source, self.digest = rig, rig.source, rig.digest
         self.surface = rig.surface(_VERTICES)
         self.library, self.faces = rig.library, rig.faces
 
@@ -146,6 +149,6 @@ def load_fitter(choice: BodyChoice) -> Fitter:
     if choice.skeleton is not None:
         return RigFitter(read_rig(choice.skeleton).resized(choice.size))
     if choice.body is None:
-        return BodyFitter(builtin_body(), "the built-in body (CC0)")
+        return BodyFitter(builtin_body(), "the built-in body (CC0)", "")
     path = find_body(Path(choice.body), None, choice.gender)
-    return BodyFitter(load_body(path), f"body {path}")
+    return BodyFitter(load_body(path), f"body {path}", file_digest(path)[:16])

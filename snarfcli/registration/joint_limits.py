@@ -57,19 +57,21 @@ def angles_from_poses(joint_names: Sequence[str], poses: Array) -> dict[str, Arr
     return angles
 
 
-def near_limits(joint_names: Sequence[str], pose: Array) -> tuple[str, ...]:
-    """Return the joints of a pose [J, 3] that are near a limit or past it, in the body's spelling.
+def near_limits(joint_names: Sequence[str], poses: Array) -> dict[str, NDArray[np.intp]]:
+    """Return the numbers of the poses [T, J, 3] in which a joint is near a limit or past it, by joint in the body's spelling.
 
-    Straight elbows and knees count only if they are bent backwards. A body without SMPL's joints has none.
+    Joints that never are have no entry. Straight elbows and knees count only if they are bent backwards. A body without SMPL's
+    joints has no limits.
     """
     spellings = {plain_name(name): name for name in joint_names}
-    near = []
-    for name, value in angles_from_poses(joint_names, pose[None]).items():
+    near: dict[str, NDArray[np.bool_]] = {}
+    for name, values in angles_from_poses(joint_names, poses).items():
         side, part = (name[:2], name[2:]) if name[:2] in ("l_", "r_") else ("", name)
         low, high = LIMITS_DEG[name]
-        if not _FREE.get(part, low) + _NEAR_DEG < value[0] < high - _NEAR_DEG:
-            near.append(spellings[side + _JOINTS_OF_ANGLES[part.partition("_")[0]]])
-    return tuple(dict.fromkeys(near))
+        is_far = (values > _FREE.get(part, low) + _NEAR_DEG) & (values < high - _NEAR_DEG)
+        joint = spellings[side + _JOINTS_OF_ANGLES[part.partition("_")[0]]]
+        near[joint] = near.get(joint, False) | ~is_far
+    return {joint: np.flatnonzero(is_near) for joint, is_near in near.items() if is_near.any()}
 
 
 def random_poses(joint_names: Sequence[str], count: int, seed: int = 0) -> Array | None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface
+from snarfcli.registration.many_poses import kinematics
 from snarfcli.registration.rotations import nearest_rotations, project_to_rotations, vector_to_matrix
 
 __all__ = ["KnownPairs", "PairedPoses"]
@@ -143,13 +144,8 @@ class KnownPairs:
     def _transforms(self, rotations: Array, translation: Array) -> tuple[Array, Array, Array]:
         """Return turns [T, J, 3, 3], joints [T, J, 3] and bone transforms [T, 3, 4 J] of poses, metres."""
         rest = self._joints
-        turns, joints = np.empty_like(rotations), np.empty(rotations.shape[:-1])
-        for joint, parent in enumerate(self._surface.parents):
-            if parent < 0:
-                turns[:, joint], joints[:, joint] = rotations[:, joint], rest[joint] + translation
-            else:
-                turns[:, joint] = turns[:, parent] @ rotations[:, joint]
-                joints[:, joint] = joints[:, parent] + turns[:, parent] @ (rest[joint] - rest[parent])
+        turns, joints = kinematics(self._surface.parents, rest, rotations)
+        joints += translation[:, None]
         shifts = joints - (turns @ rest[..., None])[..., 0]
         transforms = np.concatenate([turns, shifts[..., None]], 3)
         return turns, joints, transforms.transpose(0, 2, 1, 3).reshape(len(turns), 3, -1)

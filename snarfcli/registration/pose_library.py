@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +40,8 @@ class PoseLibrary:
             leave_out: names of motions to leave out.
         """
         names = tuple(plain_name(name) for name in joint_names)
-        motions = [name for name in (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES) if name not in leave_out]
-        poses = [builtin_motion(name, seed, frame_rate=_FRAME_RATE).poses for name in motions for seed in _SEEDS]
-        return cls.of_rig(len(names), carry_over(np.concatenate(poses), SMPL, names, "rest") if poses else None)
+        motions = tuple(name for name in (*TRAINING_SEQUENCES, *OUT_OF_DISTRIBUTION_SEQUENCES) if name not in leave_out)
+        return cls.of_rig(len(names), carry_over(_poses(motions), SMPL, names, "rest") if motions else None)
 
     @classmethod
     def of_rig(cls, joints: int, poses: Array | None = None) -> PoseLibrary:
@@ -52,6 +52,13 @@ class PoseLibrary:
     def prior(self) -> PosePrior:
         """Return the prior by which poses unlike those of the library cost more; a weak one if the library has few."""
         return PosePrior.of_poses(self.poses) if len(self.poses) >= _FEW else PosePrior.weak(self.poses.shape[1])
+
+
+@lru_cache(maxsize=4)  # making them takes a second, and a process may fit many subjects
+def _poses(motions: tuple[str, ...]) -> Array:
+    """Return the poses [L, J, 3] of built-in motions, all seeds."""
+    poses = [builtin_motion(name, seed, frame_rate=_FRAME_RATE).poses for name in motions for seed in _SEEDS]
+    return np.concatenate(poses)
 
 
 def facing_forwards(poses: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -64,6 +65,12 @@ class RigSurface:
     def length_m(self) -> float:
         """Longest side of the mesh in the rest pose."""
         return float(np.ptp(self.vertices, axis=0).max())
+
+    @property
+    def digest(self) -> str:
+        """Digest of the mesh and the joints."""
+        parts = [(self.vertices, "<f4"), (self.faces, "<i8"), (self.skeleton.joints_rest.numpy(), "<f4")]
+        return hashlib.sha256(b"".join(np.asarray(part, kind).tobytes() for part, kind in parts)).hexdigest()[:16]
 
     @cached_property
     def library(self) -> PoseLibrary:

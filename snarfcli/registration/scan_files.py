@@ -11,29 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli import point_clouds
-from snarfcli.datasets.mesh_folders import POSE_FILES
 from snarfcli.errors import UserError
-from snarfcli.formats.surfaces import read_surface
-from snarfcli.point_clouds import estimate_normals
-from snarfcli.point_clouds.files import PointFile, list_frames, read_frame
+from snarfcli.files import file_digest
+from snarfcli.point_clouds import PointFile, estimate_normals, read_frame
 from snarfcli.sampling.surface import oriented_surface_samples
 
-__all__ = [
-    "FEWEST_POINTS",
-    "ScanFacts",
-    "examine_files",
-    "fingerprint",
-    "list_scans",
-    "read_scan",
-    "read_vertices",
-    "topology_of",
-]
+__all__ = ["FEWEST_POINTS", "ScanFacts", "examine_files", "fingerprint", "read_scan", "topology_of"]
 
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 500
 """A frame with fewer points says too little about a pose."""
-_NO_SCANS = (*POSE_FILES, "skeleton.npz", "split.json")
 
 
 @dataclass(frozen=True)
@@ -44,11 +32,8 @@ class ScanFacts:
     """Why it cannot be used; empty if it can."""
     topology: str = ""
     """Digest of the faces of a mesh and its number of vertices; empty for a point cloud."""
-
-
-def list_scans(folder: Path) -> list[Path]:
-    """Return the scans directly inside a folder, in natural order."""
-    return list_frames(folder, leave_out=_NO_SCANS)
+    content: str = ""
+    """Digest of the content of the file; empty if it cannot be read."""
 
 
 def read_scan(path: Path, count: int, seed: int, *, check_normals: bool = False) -> tuple[Array, Array, str]:
@@ -79,15 +64,6 @@ def read_scan(path: Path, count: int, seed: int, *, check_normals: bool = False)
     return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12), ""
 
 
-def read_vertices(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    """Return the vertices [V, 3] and faces [F, 3] of a mesh, units and axes of the file.
-
-    Raises:
-        UserError: the file cannot be read.
-    """
-    return read_surface(path)
-
-
 def examine_files(paths: Sequence[Path]) -> Iterator[ScanFacts]:
     """Read files, and yield for each what is known of it."""
     yield from map(_examine, paths)
@@ -95,13 +71,14 @@ def examine_files(paths: Sequence[Path]) -> Iterator[ScanFacts]:
 
 def _examine(path: Path) -> ScanFacts:
     try:
-        frame = read_frame(path)
+        frame, content = read_frame(path), file_digest(path)
     except UserError as error:
         return ScanFacts(str(error))
     if not isinstance(frame, PointFile):
-        return ScanFacts(topology=topology_of(len(frame[0]), frame[1]))
+        return ScanFacts(topology=topology_of(len(frame[0]), frame[1]), content=content)
     count = len(frame.points)
-    return ScanFacts("" if count >= FEWEST_POINTS else f"scan {path}: wanted at least {FEWEST_POINTS} points, got {count}")
+    problem = f"scan {path}: wanted at least {FEWEST_POINTS} different points, got {count}" if count < FEWEST_POINTS else ""
+    return ScanFacts(problem, content=content)
 
 
 def topology_of(vertices: int, faces: NDArray) -> str:
@@ -109,7 +86,7 @@ def topology_of(vertices: int, faces: NDArray) -> str:
     return hashlib.sha256(f"{vertices} ".encode() + np.ascontiguousarray(faces, "<i8").tobytes()).hexdigest()[:16]
 
 
-def fingerprint(paths: Sequence[Path]) -> str:
-    """Return a digest of the names and sizes of files, which tells whether they have changed."""
-    listed = "\n".join(f"{path.name}\0{path.stat().st_size}" for path in paths)
+def fingerprint(paths: Sequence[Path], facts: Sequence[ScanFacts]) -> str:
+    """Return a digest of the names and contents of scans, which tells whether they have changed."""
+    listed = "\n".join(f"{path.name}\0{one.content}" for path, one in zip(paths, facts, strict=True))
     return hashlib.sha256(listed.encode()).hexdigest()[:16]

@@ -13,13 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from snarfcli.datasets.mesh_folders import meshes_folder, rigged_files, skeleton_files, subfolders
+from snarfcli.datasets.mesh_folders import frame_files, meshes_folder, rigged_files, skeleton_files, subfolders
 from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.datasets.rigged import read_rigged_files
 from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError, nearest
+from snarfcli.formats.surfaces import read_surface
 from snarfcli.names import folder_names
-from snarfcli.registration.scan_files import list_scans, read_scan, read_vertices
+from snarfcli.registration.scan_files import read_scan
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.surroundings import Floor, without_surroundings
 
@@ -91,11 +92,11 @@ class ScanSequence:
         Raises:
             UserError: the file cannot be read.
         """
-        return self.world.points(read_vertices(self.paths[index])[0])
+        return self.world.points(read_surface(self.paths[index])[0])
 
     def faces(self) -> NDArray[np.int64]:
         """Return the faces [F, 3] of the mesh of the first frame."""
-        return read_vertices(self.paths[0])[1]
+        return read_surface(self.paths[0])[1]
 
     def chosen(self, frames: Sequence[int]) -> ScanSequence:
         """Return the sequence with some of its frames."""
@@ -112,9 +113,9 @@ def scan_subjects(request: Request) -> dict[str, Path]:
     """
     folder = meshes_folder(request)
     whole, found = {folder.absolute().name: folder}, _folders_with_scans(folder)
-    if skeleton_files(folder) or list_scans(folder):
+    if skeleton_files(folder) or frame_files(folder):
         return whole
-    is_one = request.config.folder is not None and found and all(list_scans(path) for path in found.values())
+    is_one = request.config.folder is not None and found and all(frame_files(path) for path in found.values())
     return whole if is_one else found
 
 
@@ -133,17 +134,17 @@ def find_scans(subject: str, request: Request) -> tuple[Path, list[ScanFolder]]:
         known = f"; wanted one of {', '.join(list(places)[:8])}" if places else f"; wanted {_WANTED}"
         raise UserError(f"no subject '{subject}' in {folder}{nearest(subject, places) or known}")
     place = places[subject]
-    folders = [path for path in subfolders(place) if list_scans(path)] or [place]
+    folders = [path for path in subfolders(place) if frame_files(path)] or [place]
     if folders == [place]:
         _check_not_rigged(place)
     names = folder_names(path.name if path != place else subject for path in folders)
-    return place, [ScanFolder(name, path, tuple(list_scans(path))) for name, path in zip(names, folders, strict=True)]
+    return place, [ScanFolder(name, path, tuple(frame_files(path))) for name, path in zip(names, folders, strict=True)]
 
 
 def _folders_with_scans(folder: Path) -> dict[str, Path]:
     """Return the folders in a folder that have scans, or folders with scans, by name."""
     inside = subfolders(folder)
-    return {path.name: path for path in inside if list_scans(path) or any(map(list_scans, subfolders(path)))}
+    return {path.name: path for path in inside if frame_files(path) or any(map(frame_files, subfolders(path)))}
 
 
 def _check_not_rigged(place: Path) -> None:

@@ -30,6 +30,7 @@ from snarfcli.registration.written import (
     FitMade,
     FittedFile,
     foreign_files,
+    own_poses,
     read_fitted,
     read_made,
     remove_replaced,
@@ -80,9 +81,9 @@ def fit_subject(subject: str, request: Request, options: FitOptions) -> bool:
 def _fit(subject: str, place: Path, folders: Sequence[ScanFolder], options: FitOptions) -> bool:
     """Do all the work, while the lock of the folder is held."""
     _check_others(place, folders, options)
-    settings = options.recorded()
     made = None if options.overwrite else read_made(place)
     fitter = load_fitter(options.body)
+    settings = options.recorded() | {"body_digest": fitter.digest}
     if made is not None:
         _require_same(place, made, settings)
         made = made if len(made.betas) == fitter.surface.num_betas else None  # a damaged file
@@ -98,6 +99,8 @@ def _fit(subject: str, place: Path, folders: Sequence[ScanFolder], options: FitO
         fitter = load_fitter(scans.options.body)
     if made is None:
         made = decide_shape(subject, scans, fitter, settings)
+        for path in (place / REPORT, place / FIGURE, *own_poses([folder.folder for folder in folders])):
+            path.unlink(missing_ok=True)  # of an earlier fit, whose poses are not those of the new skeleton
         write_skeleton(place, fitter.skeleton(made.betas), made)
         remove_replaced(place, [])
     header = {"subject": subject, "body": fitter.source, "settings": settings, "facts": list(scans.survey.facts)}
@@ -132,33 +135,55 @@ def _fit_missing(
     subject: str, place: Path, scans: SubjectScans, fitter: Fitter, made: FitMade, header: dict[str, Any]
 ) -> list[SequenceReport]:
     """Fit the sequences that have no poses of this fit yet, and return the reports of all."""
+    names = fitter.surface.joint_names
+    sources = [fingerprint(folder.paths, facts) for folder, facts in zip(scans.folders, scans.facts, strict=True)]
+    done, missing = _finished(scans, made, sources, names)
+    count = len(done) + len(missing)
+    write_fit_report(place / REPORT, header, made, _in_order(done), is_complete=not missing)
+    for number, fitted, seconds in _fits(subject, scans, made, missing):
+        folder = scans.folders[number]
+        whole = _whole(fitted, scans.facts[number], scans.usable(number), sources[number], seconds)
+        write_fitted(folder.folder, whole, made, scans.options.frame_rate)
+        remove_replaced(place, [folder.folder])
+        done[number] = SequenceReport(folder.name, number, whole, names)
+        log.info("%s", done[number].line())
+        write_fit_report(place / REPORT, header, made, _in_order(done), is_complete=len(done) == count)
+    return _in_order(done)
+
+
+def _finished(
+    scans: SubjectScans, made: FitMade, sources: Sequence[str], names: tuple[str, ...]
+) -> tuple[dict[int, SequenceReport], list[int]]:
+    """Return the reports of the sequences that have poses of this fit, by number, and the numbers of the others.
+
+    Args:
+        scans: of the subject.
+        made: the fit.
+        sources: digests of the scans of each sequence.
+        names: of the joints.
+    """
     done: dict[int, SequenceReport] = {}
     missing: list[int] = []
-    names = fitter.surface.joint_names
+    changed: list[str] = []
     for number, folder in enumerate(scans.folders):
         if not scans.usable(number):
             log.warning("left out: sequence %s, of which no frame can be read", folder.name)
             continue
         there = read_fitted(folder.folder, made, len(names))
-        if there is not None and there.source == fingerprint(folder.paths):
+        if there is not None and (there.source, len(there.poses)) == (sources[number], len(folder.paths)):
             done[number] = SequenceReport(folder.name, number, there, names)
         else:
             missing.append(number)
+            changed += [] if there is None else [folder.name]
+    if changed:
+        log.info(
+            "the scans of %s have changed, such as %s, which is fitted again", counted(len(changed), "sequence"), changed[0]
+        )
+    if changed and not done:
+        log.warning("warning: shape and unit are kept from earlier scans; if those were of another person, give overwrite=true")
     if done:
         log.info("%d of %s fitted already", len(done), counted(len(done) + len(missing), "sequence"))
-
-    count = len(done) + len(missing)
-    for number, fitted, seconds in _fits(subject, scans, made, missing):
-        folder = scans.folders[number]
-        whole = _whole(fitted, scans.facts[number], scans.usable(number), fingerprint(folder.paths), seconds)
-        write_fitted(folder.folder, whole, made, scans.options.frame_rate)
-        remove_replaced(place, [folder.folder])
-        done[number] = SequenceReport(folder.name, number, whole, names)
-        log.info("%s", done[number].line())
-        if len(done) < count:
-            write_fit_report(place / REPORT, header, made, _in_order(done), is_complete=False)
-    write_fit_report(place / REPORT, header, made, _in_order(done), is_complete=True)
-    return _in_order(done)
+    return done, missing
 
 
 def _in_order(done: Mapping[int, SequenceReport]) -> list[SequenceReport]:
@@ -207,8 +232,9 @@ def _whole(
     fitted: FittedSequence, facts: Sequence[ScanFacts], usable: Sequence[int], source: str, seconds: float
 ) -> FittedFile:
     """Return the poses of all frames of a sequence; those that cannot be read have the pose of the nearest one."""
-    nearest = np.abs(np.arange(len(facts))[:, None] - np.array(usable)).argmin(1)
-    is_read = np.isin(np.arange(len(facts)), usable)
+    frames = np.arange(len(facts))
+    nearest = np.searchsorted((np.array(usable[1:]) + np.array(usable[:-1])) / 2, frames)  # the earlier one of two
+    is_read = np.isin(frames, usable)
     reasons = [one_line(one.problem or fitted.reasons[nearest[frame]], LONGEST_REASON) for frame, one in enumerate(facts)]
     return FittedFile(
         fitted.poses[nearest],

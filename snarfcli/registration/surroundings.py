@@ -31,6 +31,7 @@ _MEASURED = 4000  # points
 
 _LINK = 0.035  # points closer than this are connected: 6 cm; 4,000 points on a person are 2 cm apart
 _SPARSE_LINKS = 4.0  # times the usual distance between neighbours, for scans with few points
+_LINKED = 10_000  # points, by whose links the parts of a denser scan are found: links grow with the square of their number
 _SMALLEST_PART = 0.01  # share of the points; smaller parts are stray points
 _LOOSE_GAP = 0.07  # a part this near belongs to the subject: the scan has a hole between
 _LIMB_GAP, _LIMB_SHARE = 0.17, 0.2  # so does a small part, such as a forearm, at this distance
@@ -147,12 +148,7 @@ def find_parts(points: Array) -> list[Part]:
     """
     lower, upper = robust_box(points)
     length = float((upper - lower).max())
-    tree = KDTree(points)
-    usual = float(np.median(tree.query(points[:500], 2)[0][:, 1]))
-    link = max(_LINK * length, _SPARSE_LINKS * usual)
-    pairs = tree.query_pairs(link, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(points), len(points)))
-    labels = connected_components(graph, directed=False)[1]
+    labels = _labels(points, _LINK * length)
     sizes = np.bincount(labels)
     order = [label for label in np.argsort(-sizes, kind="stable") if sizes[label] >= _SMALLEST_PART * len(points)]
     if len(order) < 2:  # also if all points are far apart
@@ -168,6 +164,19 @@ def find_parts(points: Array) -> list[Part]:
         else:
             apart.append(_part(points, members))
     return [_part(points, main), *apart]
+
+
+def _labels(points: Array, link: float) -> NDArray[np.intp]:
+    """Return the number of the connected part of each point [P]; `link` is the distance below which points are connected."""
+    linked = points
+    if len(points) > _LINKED:
+        linked = points[np.random.default_rng(0).permutation(len(points))[:_LINKED]]
+    tree = KDTree(linked)
+    usual = float(np.median(tree.query(linked[:500], 2)[0][:, 1]))
+    pairs = tree.query_pairs(max(link, _SPARSE_LINKS * usual), output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(linked), len(linked)))
+    labels = np.asarray(connected_components(graph, directed=False)[1], np.intp)
+    return labels if linked is points else labels[np.asarray(tree.query(points)[1])]
 
 
 def without_surroundings(points: Array, normals: Array, floor: Floor | None, *, has_parts: bool = False) -> tuple[Array, Array]:

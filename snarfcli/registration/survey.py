@@ -14,12 +14,11 @@ from snarfcli.datasets.recorded_sequence import person_scale
 from snarfcli.errors import UserError
 from snarfcli.registration.surroundings import AXES, Floor, Part, find_floor, find_parts, robust_box, without_surroundings
 
-__all__ = ["UNITS", "Sample", "Survey", "survey_samples"]
+__all__ = ["Sample", "Survey", "survey_samples"]
 
 Array = NDArray[np.float64]
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Metres per unit of the units that are guessed."""
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # metres per unit of those that are guessed
 _LENGTHS = (0.35, 1.55)  # of what is seen, as a share of the longest side of the body at rest: from crouching to reaching up
 _CLEAR = 1.3  # ratio of two sides, above which the longer one is the height
 _MOST_FLOORS = 0.5  # share of the samples that show a floor, if the sequence has one
@@ -84,9 +83,12 @@ def survey_samples(
     """
     ups = tuple(AXES) if up == "auto" else (up,)
     seen = [find_floor(sample.points, sample.normals, ups, seed=sample.frame) for sample in samples]
-    voted = [floor.up for floor in seen if floor is not None]
-    chosen_up = up if up != "auto" else max(sorted(set(voted)), key=voted.count) if voted else None
-    floors = _floors(samples, [floor if floor is not None and floor.up == chosen_up else None for floor in seen])
+    by_axis = {
+        axis: _floors(samples, [floor if floor is not None and floor.up == axis else None for floor in seen]) for axis in ups
+    }
+    best = max(ups, key=lambda axis: len(by_axis[axis]))
+    chosen_up = best if up != "auto" or by_axis[best] else None
+    floors = by_axis[best]
     above = [without_surroundings(sample.points, sample.normals, floors.get(sample.sequence)) for sample in samples]
     parts = [find_parts(points) if len(points) > 1 else [] for points, _ in above]
     subjects = [points[found[0].is_in] for (points, _), found in zip(above, parts, strict=True) if found]
@@ -147,17 +149,17 @@ def _floors(samples: Sequence[Sample], seen: Sequence[Floor | None]) -> dict[int
 def _scale(length: float, body_m: float | None, wanted: str) -> tuple[float, str]:
     """Return the metres per unit, and the reason as text; `length` is that of the subject, units of the files."""
     if wanted != "auto":
-        return float(wanted), f"scaled by {float(wanted):g} (data.scale): {float(wanted) * length:.2f} m long"
+        return float(wanted), f"one unit of the files is {float(wanted):g} m: {float(wanted) * length:.2f} m long"
     if body_m is None:
         return person_scale(length, length, wanted, None)
     low, high = (share * body_m for share in _LENGTHS)
-    for name, metres in UNITS.items():
+    for name, metres in _UNITS.items():
         if low <= metres * length <= high:
             return (
                 metres,
                 f"the files are in {name}: {metres * length:.2f} m long (guessed; data.scale=NUMBER sets metres per unit)",
             )
-    units = alternatives(f"{low / metres:.4g} to {high / metres:.4g} ({name})" for name, metres in UNITS.items())
+    units = alternatives(f"{low / metres:.4g} to {high / metres:.4g} ({name})" for name, metres in _UNITS.items())
     size = f"{length:.4g}" if math.isfinite(length) else "not finite"
     raise UserError(
         f"the unit of the scans cannot be guessed: wanted a longest side of {units}, got {size}; "

@@ -31,6 +31,7 @@ __all__ = [
     "FitMade",
     "FittedFile",
     "foreign_files",
+    "own_poses",
     "read_fitted",
     "read_made",
     "remove_replaced",
@@ -84,7 +85,7 @@ class FittedFile:
     reasons: tuple[str, ...]
     """Per frame, why it is not trusted; empty for frames that are."""
     source: str
-    """Digest of names and sizes of the scans."""
+    """Digest of names and contents of the scans."""
     seconds: float
     """Processor time of the fit."""
 
@@ -94,6 +95,11 @@ def foreign_files(place: Path, folders: Sequence[Path]) -> list[Path]:
     candidates = skeleton_files(place)
     candidates += [folder / name for folder in folders for name in POSE_FILES if (folder / name).is_file()]
     return [path for path in dict.fromkeys(candidates) if not _is_own(path)]
+
+
+def own_poses(folders: Sequence[Path]) -> list[Path]:
+    """Return the pose files that `snarf fit` has written in some folders."""
+    return [path for path in (folder / _POSES for folder in folders) if path.is_file() and _is_own(path)]
 
 
 def write_skeleton(place: Path, skeleton: Skeleton, made: FitMade) -> None:
@@ -127,7 +133,7 @@ def read_made(place: Path) -> FitMade | None:
     except (UserError, KeyError, ValueError, TypeError, OverflowError, RecursionError):
         return None
     numbers = np.array([*betas.reshape(-1), world.scale, made.size])
-    is_whole = betas.ndim == 1 and np.isfinite(numbers).all() and min(world.scale, made.size) > 0 and world.up in AXES
+    is_whole = betas.ndim == 1 and (np.abs(numbers) < _LARGEST).all() and min(world.scale, made.size) > 0 and world.up in AXES
     return made if is_whole and isinstance(settings, dict) else None
 
 

@@ -195,6 +195,50 @@ def test_an_interrupted_fit_goes_on(
     fit.run(_config(tmp_path))
     assert "1 of 2 sequences fitted already" in caplog.text
     assert "run: 1 frame" in caplog.text
+    assert "the scans of 1 sequence have changed, such as run" in caplog.text
+    assert "kept from earlier scans" not in caplog.text
+
+
+def test_scans_that_all_changed_are_told(
+    tmp_path: Path, me: Path, quick: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fit.run(_config(tmp_path))
+    for path in me.rglob("*.ply"):
+        content = bytearray(path.read_bytes())
+        content[content.index(b"end_header") + 11] ^= 1  # a coordinate; the size is the same
+        path.write_bytes(content)
+    assert fit.run(_config(tmp_path)) == 0
+    assert "shape and unit are kept from earlier scans" in caplog.text
+    assert json.loads((me / "fit.json").read_text())["complete"] is True
+
+
+def test_a_new_start_leaves_no_poses_of_the_earlier_fit(tmp_path: Path, me: Path, quick: pytest.MonkeyPatch) -> None:
+    fit.run(_config(tmp_path))
+
+    def stop(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    with quick.context() as patch:
+        patch.setattr(subject_fit, "write_fitted", stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit.run(_config(tmp_path, seed=5, overwrite=True))
+    assert _files(me) == {"skeleton.npz", "fit.json"}
+    report = json.loads((me / "fit.json").read_text())
+    assert (report["complete"], report["sequences"]) == (False, [])
+
+
+def test_another_body_in_the_same_file_is_noticed(tmp_path: Path, quick: pytest.MonkeyPatch) -> None:
+    motion = animal_motion("trot", 2)
+    write_animal_meshes(tmp_path / "meshes" / "me", make_animal(0.06), [motion])
+    for path in (tmp_path / "meshes" / "me").rglob("*.*"):
+        if path.suffix != ".obj":
+            path.unlink()
+    rig = tmp_path / "animal.glb"
+    rig.write_bytes(animal_glb(make_animal(0.06), [motion]))
+    fit.run(_config(tmp_path, skeleton=str(rig)))
+    rig.write_bytes(animal_glb(make_animal(0.08), [motion]))
+    with pytest.raises(UserError, match=r"fitted with other settings \(body_digest \w+ -> \w+\)"):
+        fit.run(_config(tmp_path, skeleton=str(rig)))
 
 
 def test_a_second_fit_waits_or_is_told(tmp_path: Path, me: Path, quick: pytest.MonkeyPatch) -> None:

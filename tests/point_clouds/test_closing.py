@@ -36,9 +36,10 @@ def test_missing_feet_are_closed():
 def test_the_unit_makes_no_difference():
     points, normals = sampled(body_mesh(), 1000)
     vertices, faces = close_surface(points, normals)
-    scaled, same = close_surface(1000 * points, normals)
-    np.testing.assert_array_equal(same, faces)
-    np.testing.assert_allclose(scaled, 1000 * vertices, atol=0.1)
+    for unit in (1e3, 1e25, 1e-25):
+        scaled, same = close_surface(unit * points, normals)
+        np.testing.assert_array_equal(same, faces)
+        np.testing.assert_allclose(scaled, unit * vertices, atol=1e-4 * unit)
 
 
 def test_inward_normals_are_an_error():

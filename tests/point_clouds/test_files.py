@@ -88,6 +88,21 @@ def test_every_format_gives_the_points(name, tmp_path):
             np.testing.assert_allclose(found.normals, NORMALS, atol=1e-7)
 
 
+@pytest.mark.parametrize("with_normals", [False, True])
+def test_points_that_occur_several_times_are_kept_once(with_normals, tmp_path):
+    again = np.concatenate([np.arange(40), np.arange(39, -1, -1), [7, 7]])
+    arrays = {"points": POINTS[again]} | ({"normals": np.concatenate([NORMALS, np.ones((42, 3))])} if with_normals else {})
+    found = read_points(write(tmp_path, "a.npz", array_file(np.savez, **arrays)))
+    np.testing.assert_array_equal(found.points, POINTS)
+    if with_normals:
+        np.testing.assert_array_equal(found.normals, NORMALS)
+    beside = POINTS[0] + np.array([0.7825, 0.0, -0.5377])  # as far along the direction that is compared first
+    different = np.stack([POINTS[0], beside, POINTS[0]])
+    np.testing.assert_array_equal(
+        read_points(write(tmp_path, "b.npy", array_file(np.save, points=different))).points, different[:2]
+    )
+
+
 @pytest.mark.parametrize("suffix", ["ply", "obj", "off", "stl", "glb"])
 def test_a_frame_with_triangles_is_a_surface(suffix, tmp_path):
     path = write(tmp_path, f"a.{suffix}", trimesh.creation.icosphere(1).export(file_type=suffix))  # pyright: ignore[reportArgumentType]

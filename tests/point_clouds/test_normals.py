@@ -56,6 +56,16 @@ def test_given_normals_are_kept_or_turned():
     assert ((mixed.normals * true).sum(axis=1) > 0.5).mean() > 0.9
 
 
+@pytest.mark.filterwarnings("error")
+def test_points_of_no_area_do_no_harm():
+    points = np.concatenate([ball(), np.zeros((20, 3))])  # depth cameras put points without depth there
+    outward = np.concatenate([ball(), np.zeros((20, 3))])
+    for normals in (estimate_normals(points), check_normals(points, -outward).normals):
+        assert np.isfinite(normals).all()
+        assert ((normals * outward)[:600].sum(axis=1) > 0.9).all()
+    assert np.isfinite(estimate_normals(np.zeros((20, 3)))).all()
+
+
 def test_given_directions_that_are_no_normals_are_replaced():
     points = ball()
     made = check_normals(points, np.random.default_rng(3).standard_normal(points.shape))

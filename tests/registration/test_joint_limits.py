@@ -56,15 +56,17 @@ def test_other_layouts_and_spellings():
 )
 def test_joints_near_their_limits_are_named(angles, joints):
     pose = poses_from_angles({name: np.array([value]) for name, value in angles.items()}, 1)[0]
-    assert near_limits(SMPL_JOINT_NAMES, pose) == joints
-    assert near_limits(["elsewhere"] * 24, pose) == ()
+    assert tuple(near_limits(SMPL_JOINT_NAMES, pose[None])) == joints
+    assert near_limits(["elsewhere"] * 24, pose[None]) == {}
 
 
 def test_a_knee_that_is_bent_backwards_is_past_its_limit():
-    pose = np.zeros((24, 3))
-    pose[SMPL_JOINT_NAMES.index("l_knee"), 0] = np.radians(-20)
-    assert near_limits(SMPL_JOINT_NAMES, pose) == ("l_knee",)
-    assert near_limits([name.title() for name in SMPL_JOINT_NAMES], pose) == ("L_Knee",)
+    poses = np.zeros((3, 24, 3))
+    poses[1:, SMPL_JOINT_NAMES.index("l_knee"), 0] = np.radians(-20)
+    for names, knee in ((SMPL_JOINT_NAMES, "l_knee"), ([name.title() for name in SMPL_JOINT_NAMES], "L_Knee")):
+        found = near_limits(names, poses)
+        assert list(found) == [knee]
+        assert found[knee].tolist() == [1, 2]
 
 
 def test_built_in_motions_are_inside_the_limits():

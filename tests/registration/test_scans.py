@@ -12,12 +12,13 @@ from toy_animal import animal_motion, make_animal
 from toy_animal_files import animal_glb
 from toy_scans import floor, toy_mesh, write_scans
 
+from snarfcli.datasets.mesh_folders import frame_files
 from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError
 from snarfcli.files import write_arrays
-from snarfcli.registration.scan_files import examine_files, fingerprint, list_scans, read_scan
+from snarfcli.registration.scan_files import FEWEST_POINTS, examine_files, fingerprint, read_scan
 from snarfcli.registration.scans import ScanSequence, find_scans, scan_subjects
 from snarfcli.registration.surroundings import Floor
 from snarfcli.sampling import oriented_surface_samples
@@ -86,7 +87,7 @@ def test_point_clouds_get_normals_where_they_have_none_or_wrong_ones(tmp_path):
     mixed = normals * np.where(np.arange(2000) % 2, 1, -1)[:, None]
     np.savez(tmp_path / "2.npz", points=points, normals=mixed)
     write_arrays(tmp_path / "poses.npz", {"poses": np.zeros((3, 24, 3))})  # is no scan
-    paths = tuple(list_scans(tmp_path))
+    paths = tuple(frame_files(tmp_path))
     assert [path.name for path in paths] == ["0.npz", "1.npz", "2.npz"]
     assert [read_scan(path, 1500, 0, check_normals=True)[2] for path in paths] == [
         "", "", "pointed to both sides and were turned outward"
@@ -132,6 +133,28 @@ def test_files_that_cannot_be_used_are_told_without_an_error(tmp_path):
     assert [bool(one.problem) for one in facts] == [False, False, True, True, True]
     assert facts[0].topology == facts[1].topology != ""
     assert "NaN" in facts[4].problem
-    before = fingerprint(paths)
-    paths[0].write_bytes(paths[0].read_bytes() + b" ")
-    assert fingerprint(paths) != before
+
+
+def test_scans_have_changed_if_their_content_or_name_has(tmp_path):
+    write_scans(tmp_path / "walk", 2)
+    paths = sorted((tmp_path / "walk").iterdir())
+    before = fingerprint(paths, list(examine_files(paths)))
+    assert fingerprint(paths, list(examine_files(paths))) == before
+    moved = [path.rename(path.with_suffix(".PLY")) for path in paths]
+    assert fingerprint(moved, list(examine_files(moved))) != before
+    first, other = paths = [path.rename(path.with_suffix(".ply")) for path in moved]
+    content = first.read_bytes()
+    changed = content[:-1] + bytes([content[-1] ^ 1])  # of the same size
+    first.write_bytes(changed)
+    assert fingerprint(paths, list(examine_files(paths))) != before
+    first.write_bytes(content)
+    assert fingerprint([first, other], list(examine_files(paths))) == before
+
+
+def test_points_that_occur_several_times_count_once(tmp_path):
+    points = np.random.default_rng(0).random((FEWEST_POINTS, 3))
+    np.save(tmp_path / "0.npy", np.repeat(points, 6, axis=0))
+    np.save(tmp_path / "1.npy", np.repeat(points[1:], 6, axis=0))
+    enough, few = examine_files([tmp_path / "0.npy", tmp_path / "1.npy"])
+    assert not enough.problem
+    assert f"at least {FEWEST_POINTS} different points, got {FEWEST_POINTS - 1}" in few.problem

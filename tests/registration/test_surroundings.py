@@ -39,7 +39,7 @@ def test_a_person_alone_has_no_floor():
 def test_other_things_stand_apart():
     points, normals = person()
     box = trimesh.creation.box((0.5, 0.9, 0.5))
-    places, faces = trimesh.sample.sample_surface(box, 900, seed=0)
+    places, faces = trimesh.sample.sample_surface(box, 900, seed=0)[:2]
     more = together((points, normals), (places + np.array([1.4, 0, 0]), box.face_normals[faces]))
     parts = find_parts(more[0])
     assert [int(part.is_in.sum()) for part in parts] == [3000, 900]
@@ -47,6 +47,16 @@ def test_other_things_stand_apart():
     assert parts[1].length == pytest.approx(0.9, abs=0.01)
     alone, _ = without_surroundings(*more, None, has_parts=True)
     np.testing.assert_array_equal(alone, points)
+
+
+def test_dense_scans_have_the_parts_of_sparse_ones():
+    ball = np.random.default_rng(5).standard_normal((30_000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    points = np.concatenate([ball, 0.2 * ball[:3000] + (2, 0, 0)])
+    mixed = np.random.default_rng(6).permutation(len(points))
+    parts = find_parts(points[mixed])
+    assert len(parts) == 2
+    np.testing.assert_array_equal(parts[0].is_in, mixed < 30_000)
 
 
 def test_a_gap_and_stray_points_do_not_split_a_person():

@@ -20,6 +20,7 @@ from snarfcli.registration.written import (
     FitMade,
     FittedFile,
     foreign_files,
+    own_poses,
     read_fitted,
     read_made,
     remove_replaced,
@@ -75,12 +76,20 @@ def test_a_fit_reads_its_own_files_only(tmp_path: Path) -> None:
     assert there.reasons == ("far away", "")
     assert read_fitted(tmp_path, made, 23) is None
     assert not foreign_files(tmp_path, [tmp_path])
+    assert own_poses([tmp_path, tmp_path / "elsewhere"]) == [tmp_path / "poses.npz"]
     assert read_fitted(tmp_path, FitMade(BETAS + 0.1, made.world, SETTINGS), 24) is None
     assert read_fitted(tmp_path, FitMade(BETAS, made.world, {**SETTINGS, "seed": 1}), 24) is None
     for name in ("skeleton.npz", "poses.npz"):
         (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-200])
     assert read_made(tmp_path) is None
     assert read_fitted(tmp_path, made, 24) is None
+
+
+@pytest.mark.parametrize("betas", [np.nan, 1e300])
+def test_a_skeleton_with_numbers_of_a_damaged_file_is_none(tmp_path: Path, betas: float) -> None:
+    skeleton = builtin_body().skeleton(BETAS)
+    write_skeleton(tmp_path, skeleton, FitMade(np.full(10, betas), FileToWorld(1.0, "y"), SETTINGS))
+    assert read_made(tmp_path) is None
 
 
 def test_files_of_others_are_found_and_replaced(tmp_path: Path) -> None:
@@ -90,6 +99,7 @@ def test_files_of_others_are_found_and_replaced(tmp_path: Path) -> None:
     (tmp_path / "walk" / "motion.bvh").write_text("HIERARCHY")
     found = foreign_files(tmp_path, [tmp_path / "walk"])
     assert [path.name for path in found] == ["skeleton.json", "poses.npz", "motion.bvh"]
+    assert not own_poses([tmp_path / "walk"])
     remove_replaced(tmp_path, [])
     assert [path.name for path in foreign_files(tmp_path, [tmp_path / "walk"])] == ["poses.npz", "motion.bvh"]
     remove_replaced(tmp_path, [tmp_path / "walk"])

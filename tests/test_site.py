@@ -14,7 +14,7 @@ import pytest
 import room_graph
 from configuration import configuration_page
 from links import rewrite_links
-from pages import API_ROOMS, example_page, project_pages
+from pages import API_ROOMS, page_of, project_pages
 
 from snarfcli.cli.command_list import COMMAND_LIST
 from snarfcli.hydra_config.schema import setting_names
@@ -72,10 +72,10 @@ def test_pages_beside_docs_are_found():
     found = project_pages(ROOT)
     assert {"README.md", "CONTRIBUTING.md", "data/README.md", "examples", "examples/rays.py"} <= set(found)
     assert all((ROOT / source).exists() for source in found)
-    overview = example_page(ROOT / "examples")
+    overview = page_of(ROOT / "examples")
     for path in (ROOT / "examples").glob("*.*py*"):
         assert f"[{path.name}](examples/{path.name})" in overview
-    page = example_page(ROOT / "examples/rays.py")
+    page = page_of(ROOT / "examples/rays.py")
     assert (ROOT / "examples/rays.py").read_text() in page
     assert page.startswith("# rays.py\n\nLearn a canonical field")
 
@@ -136,5 +136,10 @@ def _public_names(room: str) -> list[str]:
 
 def test_the_search_of_the_site_knows_its_pages(site):
     index = (site / "search/search_index.js").read_text("utf-8")
-    for place in ("papers.html", "api/deformer.html#snarfcli.deformer.ForwardDeformer", "configuration.html"):
+    for place in (
+        "first_avatar.html",
+        "papers.html",
+        "api/deformer.html#snarfcli.deformer.ForwardDeformer",
+        "configuration.html",
+    ):
         assert f'"location":"{place}' in index

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from configuration import configuration_page
 from links import rewrite_links
-from pages import api_pages, example_page, project_pages
+from pages import api_pages, page_of, project_pages
 from room_graph import draw_graphs
 
 ROOT = Path(__file__).parents[2]
@@ -30,8 +30,7 @@ def on_files(files: Any, config: Any) -> Any:
     from mkdocs.structure.files import File
 
     contents = {CONFIGURATION: configuration_page()} | api_pages()
-    for source, page in PAGES.items():
-        contents[page] = example_page(ROOT / source) if source.startswith("examples") else (ROOT / source).read_text("utf-8")
+    contents |= {page: page_of(ROOT / source) for source, page in PAGES.items()}
     for page, content in contents.items():
         files.append(File.generated(config, page, content=content))
     return files

@@ -6,7 +6,7 @@ import ast
 import json
 from pathlib import Path
 
-__all__ = ["api_pages", "example_page", "project_pages"]
+__all__ = ["api_pages", "page_of", "project_pages"]
 
 _NAMED = {
     "README.md": "index.md",
@@ -43,6 +43,7 @@ _API_PAGE = """# snarf.{room}
 def project_pages(root: Path) -> dict[str, str]:
     """Return the files of the project that are pages of the site, besides those in docs/, with the page of each."""
     found = {source: page for source, page in _NAMED.items() if (root / source).is_file()}
+    found["benchmarks/results"] = "benchmarks/index.md"
     for path in sorted((root / "benchmarks/results").glob("*.md")):
         found[f"benchmarks/results/{path.name}"] = f"benchmarks/{path.name}"
     found["examples"] = "examples/index.md"
@@ -73,13 +74,15 @@ Lengths are in metres, angles in radians. Shapes of arrays are in square bracket
 """
 
 
-def example_page(path: Path) -> str:
-    """Return the page of an example, or of the folder of all examples."""
+def page_of(path: Path) -> str:
+    """Return the page of a file: Markdown as it is, code with its first sentence; or of a folder, a list."""
     if path.is_dir():
-        return _list_of_examples(path)
+        return _list_of_examples(path) if path.name == "examples" else _list_of_pages(path)
     if path.suffix == ".ipynb":
         return _notebook_page(path)
     code = path.read_text("utf-8")
+    if path.suffix != ".py":
+        return code
     module = ast.parse(code)
     statement = (ast.get_docstring(module) or "").partition("\n\n")[0]
     return f"# {path.name}\n\n{' '.join(statement.split())}\n\n````python\n{code}````\n"
@@ -97,6 +100,15 @@ def _list_of_examples(folder: Path) -> str:
     return "\n".join(
         ["# Examples", "", "Run them with `python examples/NAME.py`.", "", "| file | shows |", "|---|---|", *rows, ""]
     )
+
+
+def _list_of_pages(folder: Path) -> str:
+    """Return links to the Markdown files of benchmarks/results by their titles."""
+    rows = [
+        f"- [{path.read_text('utf-8').partition(chr(10))[0].lstrip('# ')}](results/{path.name})"
+        for path in sorted(folder.glob("*.md"))
+    ]
+    return "\n".join(["# Measurements", "", "What the files in `benchmarks/` gave.", "", *rows, ""])
 
 
 def _notebook_page(path: Path) -> str:

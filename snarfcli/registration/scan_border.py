@@ -32,7 +32,7 @@ def find_border(points: Array, normals: Array) -> Array:
     points, normals = points[:_POINTS], normals[:_POINTS]
     if len(points) <= _NEIGHBOURS:
         return np.zeros((0, 3))
-    _, near = KDTree(points).query(points, _NEIGHBOURS + 1)
+    near = np.asarray(KDTree(points).query(points, _NEIGHBOURS + 1)[1], np.intp)
     away = points[near[:, 1:]] - points[:, None]
     is_same = (normals[near[:, 1:]] @ normals[..., None])[..., 0] > _SAME_SIDE
     across = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))

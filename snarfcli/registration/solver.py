@@ -120,7 +120,8 @@ class Agreement:
     """The same of what a step makes small: distances along the surface count a tenth, those inside the clothes nothing. Unlike
     the objective it hardly has a share that comes from the spacing of the vertices, so it tells lost limbs better."""
     residual_m: float
-    """Mean distance of both sides, metres. Distances above 10 cm count as 10 cm; vertices beyond the border do not count."""
+    """Mean distance of both sides, metres: along the normal of the scan where the normals agree, so that the spacing of the
+    points hardly counts. Distances above 10 cm count as 10 cm; vertices beyond the border of the scan do not count."""
     of_body: Array
     """[K], distance from each vertex to its match, metres; of those beyond the border of the scan, at most 3 cm."""
     of_scan: Array
@@ -239,15 +240,23 @@ def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints, *, cloth
     apart = np.where(matches.agree, np.square(height) + _ALL_DIRECTIONS * apart, apart)
     apart, squared = (np.where(matches.unseen, np.minimum(_UNSEEN_M**2, each), each) for each in (apart, squared))
     distance = np.sqrt(squared)
-    counts = np.where(matches.unseen, 0.0, matches.share)
     return Agreement(
         objective=float((matches.share * squared / (squared + _OBJECTIVE_M**2)).sum()),
         misfit=float((matches.share * apart / (apart + _OBJECTIVE_M**2)).sum()),
-        residual_m=float((counts * np.minimum(distance, _RESIDUAL_CAP_M)).sum() / counts.sum()),
+        residual_m=_residual_m(matches),
         of_body=distance[:count],
         of_scan=distance[count:],
         partners=matches.body[count:],
     )
+
+
+def _residual_m(matches: _Matches) -> float:
+    """Return the residual of an agreement."""
+    distance = np.linalg.norm(matches.offset, axis=1)
+    along = np.where(matches.agree, np.abs((matches.offset * matches.normals).sum(1)), distance)
+    counts = np.where(matches.unseen, 0.0, matches.share)
+    far = distance > _RESIDUAL_CAP_M  # a height says nothing about a match that is far to the side
+    return float((counts * np.where(far, _RESIDUAL_CAP_M, along)).sum() / counts.sum())
 
 
 def _match(posed: PosedSurface, scan: ScanPoints) -> _Matches:

@@ -75,8 +75,8 @@ def decide_shape(subject: str, scans: SubjectScans, fitter: Fitter, settings: di
         what = "person" if scans.options.body.skeleton is None else "such body"
         raise UserError(
             f"no {what} in the scans of {subject}: in the best of {counted(len(seen), 'frame')} the body is "
-            f"{1000 * residual:.0f} mm from the points on average, wanted about 15; check data.scale (now {world.scale:g}) and "
-            f"data.up (now {world.up}), or give another body or skeleton"
+            f"{1000 * residual:.0f} mm from the points on average, wanted less than 20; check data.scale (now {world.scale:g}) "
+            f"and data.up (now {world.up}), or give another body or skeleton"
         )
     _check_others(subject, scans, world)
     _compare_sequences(scans, fitter.surface, seen)

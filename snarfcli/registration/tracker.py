@@ -18,7 +18,7 @@ from snarfcli.registration.fitted_sequence import Finder, FittedSequence, Found,
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import different_frames, fit_shape
 from snarfcli.registration.solver import Agreement, PosePrior, agreement, fit_state, scales
-from snarfcli.registration.trust import find_jumps, is_suspicious, judge
+from snarfcli.registration.trust import apart_share, find_jumps, is_suspicious, judge
 
 __all__ = ["Finder", "FittedSequence", "Found", "Scans", "fit_sequence"]
 
@@ -195,18 +195,20 @@ class _Tracker:
 
     def polished(self, on_frame: Callable[[int], None] | None, *, is_ordered: bool = True) -> FittedSequence:
         """Fit all vertices to every frame, and judge the frames."""
-        states, agreements = [], []
+        states, agreements, apart = [], [], []
         for index in range(len(self.scans)):
             scan = self.scan(index)
             state = fit_state(self.surface, self._state(index), scan, _POLISH_M, self.prior, clothes_m=self.clothes_m)
             states.append(state)
             agreements.append(agreement(self.surface, state, scan, clothes_m=self.clothes_m))
+            apart.append(apart_share(agreements[-1], self.surface.points_rest, scan.points, self.clothes_m))
             if on_frame is not None:
                 on_frame(index)
         residual_m = np.array([one.residual_m for one in agreements])
         joints = np.stack([self.surface.joints(state) for state in states])
         jumps = find_jumps(joints) if is_ordered else np.full(len(states), -1)
-        reasons = judge(np.array([one.misfit for one in agreements]), residual_m, jumps, self.surface.joint_names)
+        misfit = np.array([one.misfit for one in agreements])
+        reasons = judge(misfit, residual_m, np.array(apart), jumps, self.surface.joint_names)
         return FittedSequence(
             np.stack([state.pose for state in states]),
             np.stack([state.translation for state in states]),

@@ -64,4 +64,6 @@ def write_scans(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Write a person in clothes as points without faces.")
     parser.add_argument("folder", type=Path, help="folder of the subject, such as data/meshes/me")
-    write_scans(parser.parse_args().folder)
+    parser.add_argument("--frames", type=int, default=60, help="number of frames of each motion")
+    arguments = parser.parse_args()
+    write_scans(arguments.folder, frames=arguments.frames)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,6 +81,7 @@ def run(config: FitConfig) -> int:
         UserError: a setting cannot be used, a subject is unknown or cannot be fitted, or existing poses have other settings.
         OSError: the data folder cannot be written to, or the disk is full.
     """
+    from snarfcli.datasets.mesh_folders import meshes_folder
     from snarfcli.datasets.sources import Request
     from snarfcli.registration.subject_fit import fit_subject
 
@@ -87,9 +89,10 @@ def run(config: FitConfig) -> int:
     request = Request(config.data, Path(config.data_root), config.body)
     subjects = list(_without_poses(request, config.overwrite)) if config.subject == "all" else [config.subject]
     if not subjects:
-        raise UserError(f"no scans in {request.folder}; wanted meshes/<subject>/<sequence>/ with one file per frame")
+        raise UserError(f"nothing to fit in {meshes_folder(request)}; wanted <subject>/<sequence>/ with one scan per frame")
     is_whole = [fit_subject(subject, request, options) for subject in subjects]
-    settings = f"data=meshes subject={subjects[0]}" + (f" data.folder={config.data.folder}" if config.data.folder else "")
+    places = [f"data.folder={config.data.folder}"] if config.data.folder else []
+    settings = shlex.join(["data=meshes", f"subject={subjects[0]}", *places])
     log.info('next: "snarf preprocess %s", then "snarf train %s training.refine_poses=true"', settings, settings)
     return 0 if all(is_whole) else 1
 

@@ -35,8 +35,8 @@ _SKELETON_FILES = ("skeleton.json", "skeleton.npz", "skeleton.bvh")
 _NO_POSES = ("split.json", *_SKELETON_FILES)
 
 
-def meshes_folder(request: Request) -> Path:
-    """Return the folder of the subjects.
+def meshes_folder(request: Request, wanted: str = WANTED) -> Path:
+    """Return the folder of the subjects; `wanted` says what it must have, for messages.
 
     Raises:
         UserError: it does not exist.
@@ -44,7 +44,7 @@ def meshes_folder(request: Request) -> Path:
     folder = request.folder if request.config.folder is not None else request.data_root / "meshes"
     if not folder.is_dir():
         problem = "is not a folder" if folder.exists() else "does not exist"
-        raise UserError(f"the folder of meshes {folder} {problem}; give data.folder=FOLDER with {WANTED}")
+        raise UserError(f"the folder of meshes {folder} {problem}; give data.folder=FOLDER with {wanted}")
     return folder
 
 

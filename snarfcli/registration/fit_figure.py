@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.registration.body_surface import BodyState
@@ -25,7 +26,8 @@ _ROWS = 3
 _PANEL = 320  # pixels
 _STRETCHES = 8  # parts of a sequence; at most one frame of each is among the worst, and one among the best
 _DRAWN_POINTS = 20_000
-_DISC_M = 0.008  # radius of a point
+_DISC_M = (0.004, 0.02)  # radius of a point
+_DISC = 0.75  # the same, times the distance between neighbours: most gaps close, and fingers stay apart
 
 
 def write_fit_figure(
@@ -92,7 +94,9 @@ def _draw(
 
 
 def _discs(scan: ScanPoints, camera: Camera) -> Mesh:
-    """Return the points that face a camera as small hexagons along the surface."""
+    """Return the points that face a camera as hexagons along the surface, larger where points are few."""
+    apart = KDTree(scan.points).query(scan.points, 5)[0][:, -1]
+    radius = float(np.clip(_DISC * np.median(apart), *_DISC_M))
     faces_camera = ((np.asarray(camera.position) - scan.points) * scan.normals).sum(1) > 0
     points, normals = scan.points[faces_camera], scan.normals[faces_camera]
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
@@ -100,7 +104,7 @@ def _discs(scan: ScanPoints, camera: Camera) -> Mesh:
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
     along = np.cross(normals, across)
     turn = np.pi * np.arange(6) / 3
-    corners = points[:, None] + _DISC_M * (np.cos(turn)[:, None] * across[:, None] + np.sin(turn)[:, None] * along[:, None])
+    corners = points[:, None] + radius * (np.cos(turn)[:, None] * across[:, None] + np.sin(turn)[:, None] * along[:, None])
     fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
     faces = 6 * np.arange(len(points))[:, None, None] + fan
     return Mesh(corners.reshape(-1, 3).astype(np.float32), faces.reshape(-1, 3).astype(np.int64))

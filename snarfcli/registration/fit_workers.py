@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from snarfcli.registration.body_surface import BodyState
 from snarfcli.registration.fitter import BodyChoice, Fitter, load_fitter
-from snarfcli.registration.same_topology import fit_one_topology, is_own_topology
+from snarfcli.registration.same_topology import NoUsualFrames, fit_one_topology, is_own_topology
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.scans import ScanSequence
 from snarfcli.registration.starts import Found
@@ -82,8 +82,15 @@ def _fit_sequence(
     fitter: Fitter, betas: Array, clothes_m: float, task: SequenceTask, on_frame: Callable[[int], None]
 ) -> FittedSequence:
     """Fit one sequence: by its vertices where all frames have the same, otherwise by points on the surface."""
+    told: set[int] = set()
+
+    def tell(frame: int) -> None:  # once, also where the vertices were followed in vain
+        if frame not in told:
+            told.add(frame)
+            on_frame(frame)
+
     if task.has_one_topology:
-        fitted = _follow_vertices(fitter, betas, clothes_m, task.scans, on_frame)
+        fitted = _follow_vertices(fitter, betas, clothes_m, task.scans, tell)
         if fitted is not None:
             return fitted
     return fit_sequence(
@@ -94,14 +101,15 @@ def _fit_sequence(
         betas=betas,
         clothes_m=clothes_m,
         is_ordered=task.ordered == "true" or (task.ordered == "auto" and is_in_order(task.scans)),
-        on_frame=on_frame,
+        on_frame=tell,
     )
 
 
 def _follow_vertices(
     fitter: Fitter, betas: Array, clothes_m: float, scans: ScanSequence, on_frame: Callable[[int], None]
 ) -> FittedSequence | None:
-    """Fit a sequence whose frames have the same faces; None if it is too short, or its vertices do not stay on the body."""
+    """Fit a sequence whose frames have the same faces; None if it is too short, or if its vertices
+    are not the same in most frames or do not stay on the body."""
     faces, anchors = scans.faces(), {}
 
     def refit(frame: int, near: Sequence[BodyState]) -> Found:
@@ -114,18 +122,21 @@ def _follow_vertices(
             anchors[frame] = refit(frame, ())
         best = min(found.agreement.misfit for found in anchors.values())
         anchors = {frame: found.state for frame, found in anchors.items() if found.agreement.misfit < _GOOD * best}
-    fitted = fit_one_topology(
-        fitter.whole,
-        fitter.faces,
-        faces,
-        scans.vertices,
-        len(scans),
-        anchors,
-        betas=betas,
-        clothes_m=clothes_m,
-        refit=refit,
-        on_frame=on_frame,
-    )
+    try:
+        fitted = fit_one_topology(
+            fitter.whole,
+            fitter.faces,
+            faces,
+            scans.vertices,
+            len(scans),
+            anchors,
+            betas=betas,
+            clothes_m=clothes_m,
+            refit=refit,
+            on_frame=on_frame,
+        )
+    except NoUsualFrames:
+        return None
     return fitted if fitted.is_trusted.mean() > _MOST_TRUSTED else None
 
 

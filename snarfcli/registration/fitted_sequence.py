@@ -54,7 +54,7 @@ class FittedSequence:
     betas: Array
     """[S], shape parameters."""
     residual_m: Array
-    """[T], mean distance of both sides, metres."""
+    """[T], mean distance between body and points, metres, as in `Agreement`; between pairs of vertices for one topology."""
     objective: Array
     """[T], as in `Agreement`."""
     is_trusted: NDArray[np.bool_]

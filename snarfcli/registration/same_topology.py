@@ -19,7 +19,15 @@ from snarfcli.registration.known_pairs import KnownPairs, PairedPoses
 from snarfcli.registration.rotations import matrix_to_vector
 from snarfcli.registration.tracker import FittedSequence, Found
 
-__all__ = ["OTHERS", "EdgeLengths", "TopologyFollower", "fit_one_topology", "is_own_topology", "prepare_follower"]
+__all__ = [
+    "OTHERS",
+    "EdgeLengths",
+    "NoUsualFrames",
+    "TopologyFollower",
+    "fit_one_topology",
+    "is_own_topology",
+    "prepare_follower",
+]
 
 Array = NDArray[np.float64]
 Load = Callable[[int], NDArray]
@@ -40,6 +48,10 @@ _LOST_RATIO = 3.0  # if it also is so many times that of most frames
 _OBJECTIVE_M = 0.05  # as in `solver.agreement`
 OTHERS = "its vertices are others than those of the other frames"
 """Reason why a frame is not trusted."""
+
+
+class NoUsualFrames(ValueError):
+    """No frame with a known state, or none at all, has the vertices that most frames have."""
 
 
 class EdgeLengths:
@@ -108,7 +120,7 @@ class TopologyFollower:
             on_frame: told the number of each frame that is done.
 
         Raises:
-            ValueError: no frame has the vertices of the first.
+            NoUsualFrames: no frame has the vertices of the first.
         """
         pairs = KnownPairs(self.attached.surface, self.betas, self.attached.importance)
         tell = on_frame or (lambda frame: None)
@@ -124,7 +136,7 @@ class TopologyFollower:
                 tell(int(frame))
         is_known = np.isfinite(residual)
         if not is_known.any():
-            raise ValueError("frames: wanted some with the vertices of the first, got none")
+            raise NoUsualFrames("frames: wanted some with the vertices of the first, got none")
         limit = max(_LOST_M, _LOST_RATIO * self.residual_m)
         reasons = [
             OTHERS if not known else f"{1000 * apart:.0f} mm from the body on average" if apart > limit else ""
@@ -171,7 +183,7 @@ def fit_one_topology(
         refit, on_frame: see `TopologyFollower.follow`.
 
     Raises:
-        ValueError: there are no anchors, and the topology is not the body's own.
+        NoUsualFrames: none of the anchors is a usual frame, and the topology is not the body's own; or no frame is usual.
     """
     probes = np.unique(np.linspace(0, count - 1, _PROBES).round().astype(int))
     numbers = [*anchors, *(int(probe) for probe in probes if int(probe) not in anchors)]
@@ -209,14 +221,15 @@ def prepare_follower(
         clothes_m: how far the body may be below the surface, metres.
 
     Raises:
-        ValueError: there are no states, and the topology is not the body's own; or no frame has the vertices of the faces.
+        NoUsualFrames: none of the states is of a usual frame, and the topology is not the body's own; or no frame has the
+            vertices of the faces.
     """
     edges = _usual_edges(frames, faces)
     is_known = [edges.fit(vertices) for vertices in frames]
     states = [state for state, known in zip(states, is_known, strict=False) if known]
     is_own = is_own_topology(surface_faces, edges.vertices, faces)
     if not is_own and not states:
-        raise ValueError("states: wanted those of some frames, since the topology is not that of the body, got none")
+        raise NoUsualFrames("states: wanted those of some frames, since the topology is not that of the body, got none")
     frames = [np.asarray(vertices, np.float64) for vertices, known in zip(frames, is_known, strict=True) if known]
     if betas is not None:
         shape = betas
@@ -248,7 +261,7 @@ def _usual_edges(frames: Sequence[NDArray], faces: NDArray) -> EdgeLengths:
     """Return the edges of the one of the first frames that most frames agree with."""
     whole = [vertices for vertices in frames if len(vertices) > faces.max() and np.isfinite(vertices).all()]
     if not whole:
-        raise ValueError(f"frames: wanted finite vertices, more than {faces.max()}, got none")
+        raise NoUsualFrames(f"frames: wanted finite vertices, more than {faces.max()}, got none")
     tries = [EdgeLengths(vertices, faces) for vertices in whole[:_FIRST]]
     return max(tries, key=lambda edges: sum(edges.fit(vertices) for vertices in frames))
 

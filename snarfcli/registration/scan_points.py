@@ -9,12 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from snarfcli.registration.scan_border import find_border
+
 __all__ = ["NORMALS_M", "ScanPoints", "with_normals"]
 
 Array = NDArray[np.float64]
 
 NORMALS_M = 0.08
 """Distance that counts as much as normals at 60 degrees to each other, in the search of closest points."""
+_LEAST_BORDER = 0.01  # share of the points
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,8 @@ class ScanPoints:
     """[P, 3], metres."""
     normals: Array
     """[P, 3], unit length, outward."""
+    whole: ScanPoints | None = None
+    """The scan that these points are a part of, if it has more."""
 
     @classmethod
     def sampled(cls, points: Array, normals: Array, count: int, seed: int = 0) -> ScanPoints:
@@ -35,6 +40,10 @@ class ScanPoints:
     def __len__(self) -> int:
         return len(self.points)
 
+    def first(self, count: int) -> ScanPoints:
+        """Return the first of the points; they still know where the whole scan has its border."""
+        return ScanPoints(self.points[:count], self.normals[:count], self if self.whole is None else self.whole)
+
     @cached_property
     def features(self) -> Array:
         """[P, 6], places and scaled normals."""
@@ -44,6 +53,14 @@ class ScanPoints:
     def tree(self) -> KDTree:
         """Of the features."""
         return KDTree(self.features)
+
+    @cached_property
+    def border(self) -> KDTree | None:
+        """Of the points at the border of the scan; None if its surface is closed, but for a few small holes."""
+        if self.whole is not None:
+            return self.whole.border
+        found = find_border(self.points, self.normals)
+        return KDTree(found) if len(found) > _LEAST_BORDER * len(self) else None
 
     @cached_property
     def centre(self) -> Array:

@@ -111,7 +111,7 @@ def scan_subjects(request: Request) -> dict[str, Path]:
     Raises:
         UserError: there is no folder.
     """
-    folder = meshes_folder(request)
+    folder = meshes_folder(request, _WANTED)
     whole, found = {folder.absolute().name: folder}, _folders_with_scans(folder)
     if skeleton_files(folder) or frame_files(folder):
         return whole
@@ -125,7 +125,7 @@ def find_scans(subject: str, request: Request) -> tuple[Path, list[ScanFolder]]:
     Raises:
         UserError: there is no such subject, it has no scans, or it is a rigged file that has its own motion.
     """
-    folder = meshes_folder(request)
+    folder = meshes_folder(request, _WANTED)
     places = scan_subjects(request)
     places = places if subject in places else _folders_with_scans(folder)
     if subject not in places:

@@ -40,6 +40,8 @@ _LEAST_AGREEMENT = 0.2  # cosine between the normals of a match; with less, a ma
 _DISAGREEING_WEIGHT = 0.02
 _ALL_DIRECTIONS = 0.1  # weight of the distance in all directions, relative to that along the normal
 _SCAN_POINTS = 1000  # of a scan that are matched with vertices; the vertices are matched with all points
+_BEYOND_M, _BORDER_M = 0.03, 0.02  # a vertex further than this from the scan, and this near to its border, is not seen
+_UNSEEN_M = 0.03  # distance that a vertex which is not seen counts as, so that hiding a limb is no gain
 _LEAST_WEIGHT = 1e-12  # keeps the weights of a vertex positive definite
 SHAPE_PRIOR = 1e-6  # per squared unit of a shape parameter; the weights of the matches of each side sum to 1, metres squared
 _WEAK_WEIGHT = 2e-6  # of a pose, squared metres per squared radian
@@ -118,9 +120,10 @@ class Agreement:
     """The same of what a step makes small: distances along the surface count a tenth, those inside the clothes nothing. Unlike
     the objective it hardly has a share that comes from the spacing of the vertices, so it tells lost limbs better."""
     residual_m: float
-    """Mean distance of both sides, distances above 10 cm counted as 10 cm, metres."""
+    """Mean distance of both sides, metres: along the normal of the scan where the normals agree, so that the spacing of the
+    points hardly counts. Distances above 10 cm count as 10 cm; vertices beyond the border of the scan do not count."""
     of_body: Array
-    """[K], distance from each vertex to its match, metres."""
+    """[K], distance from each vertex to its match, metres; of those beyond the border of the scan, at most 3 cm."""
     of_scan: Array
     """[M], distance from each of the first M points of the scan to its match, metres."""
     partners: NDArray[np.intp]
@@ -135,6 +138,7 @@ class _Matches:
     agree: NDArray[np.bool_]  # [K + M]
     offset: Array  # [K + M, 3] from the point of the scan to the vertex, metres
     share: Array  # [K + M] 1 / K or 1 / M
+    unseen: NDArray[np.bool_]  # [K + M] vertices whose place the scan does not show
 
 
 def scales(first_m: float, last_m: float, steps: int) -> Array:
@@ -230,20 +234,29 @@ def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints, *, cloth
     """
     matches = _match(surface.posed(state), scan)
     count = len(surface.points_rest)
-    distance = np.linalg.norm(matches.offset, axis=1)
-    squared = np.square(distance)
-    capped = np.minimum(distance, _RESIDUAL_CAP_M)
+    squared = np.square(matches.offset).sum(1)
     height, offset = _outside_clothes(matches, clothes_m)
     apart = np.square(offset).sum(1)
     apart = np.where(matches.agree, np.square(height) + _ALL_DIRECTIONS * apart, apart)
+    apart, squared = (np.where(matches.unseen, np.minimum(_UNSEEN_M**2, each), each) for each in (apart, squared))
+    distance = np.sqrt(squared)
     return Agreement(
         objective=float((matches.share * squared / (squared + _OBJECTIVE_M**2)).sum()),
         misfit=float((matches.share * apart / (apart + _OBJECTIVE_M**2)).sum()),
-        residual_m=float((matches.share * capped).sum() / 2),
+        residual_m=_residual_m(matches),
         of_body=distance[:count],
         of_scan=distance[count:],
         partners=matches.body[count:],
     )
+
+
+def _residual_m(matches: _Matches) -> float:
+    """Return the residual of an agreement."""
+    distance = np.linalg.norm(matches.offset, axis=1)
+    along = np.where(matches.agree, np.abs((matches.offset * matches.normals).sum(1)), distance)
+    counts = np.where(matches.unseen, 0.0, matches.share)
+    far = distance > _RESIDUAL_CAP_M  # a height says nothing about a match that is far to the side
+    return float((counts * np.where(far, _RESIDUAL_CAP_M, along)).sum() / counts.sum())
 
 
 def _match(posed: PosedSurface, scan: ScanPoints) -> _Matches:
@@ -257,7 +270,17 @@ def _match(posed: PosedSurface, scan: ScanPoints) -> _Matches:
     points, normals = scan.points[chosen], scan.normals[chosen]
     agree = (posed.normals[body] * normals).sum(1) > _LEAST_AGREEMENT
     share = np.concatenate([np.full(len(features), 1 / len(features)), np.full(count, 1 / count)])
-    return _Matches(body, points, normals, agree, posed.points[body] - points, share)
+    offset = posed.points[body] - points
+    return _Matches(body, points, normals, agree, offset, share, _unseen(posed, scan, offset))
+
+
+def _unseen(posed: PosedSurface, scan: ScanPoints, offset: Array) -> NDArray[np.bool_]:
+    """Return which matches are of vertices beyond the border of the scan: away from their points, and no closer to others."""
+    unseen = np.zeros(len(offset), bool)
+    if scan.border is not None:
+        apart = np.linalg.norm(offset[: len(posed.points)], axis=1)
+        unseen[: len(apart)] = (apart > _BEYOND_M) & (scan.border.query(posed.points)[0] < apart + _BORDER_M)
+    return unseen
 
 
 def _by_vertex(matches: _Matches, count: int, options: StepOptions) -> tuple[Array, Array]:
@@ -265,6 +288,7 @@ def _by_vertex(matches: _Matches, count: int, options: StepOptions) -> tuple[Arr
     height, offset = _outside_clothes(matches, options.clothes_m)
     weight = matches.share / np.square(1 + np.square(offset).sum(1) / options.scale_m**2)
     weight = np.where(matches.agree, weight, _DISAGREEING_WEIGHT * weight)
+    weight[matches.unseen] = 0.0
     pulls = weight[:, None] * (height[:, None] * matches.normals + _ALL_DIRECTIONS * offset)
     outer = weight[:, None] * matches.normals[:, _ROW] * matches.normals[:, _COLUMN]
     outer[:, _IS_DIAGONAL] += (_ALL_DIRECTIONS * weight)[:, None]

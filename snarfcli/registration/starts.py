@@ -77,8 +77,7 @@ class _Frame:
 
     def followed(self, state: BodyState, steps: int, scales_m: tuple[float, float]) -> Found:
         """Return the state after some steps of a few vertices."""
-        few = ScanPoints(self.scan.points[:_COARSE_POINTS], self.scan.normals[:_COARSE_POINTS])
-        return self.judged(self._fit(self.coarse, few, state, steps, scales_m))
+        return self.judged(self._fit(self.coarse, self.scan.first(_COARSE_POINTS), state, steps, scales_m))
 
     def finished(self, state: BodyState) -> Found:
         """Return the state after the last steps, of all vertices."""

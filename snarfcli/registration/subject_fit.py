@@ -116,8 +116,9 @@ def _check_others(place: Path, folders: Sequence[ScanFolder], options: FitOption
     if options.body.skeleton is not None and Path(options.body.skeleton).absolute() in [path.absolute() for path in others]:
         raise UserError(f"skeleton={options.body.skeleton} would be replaced by the fitted one; keep it outside of {place}")
     if others and not options.overwrite:
-        more = f" and {counted(len(others) - 1, 'more file')}" if others[1:] else ""
-        raise UserError(f"{others[0]}{more} were not written by snarf fit; move them, or give overwrite=true to replace them")
+        what = f" and {counted(len(others) - 1, 'more file')} were" if others[1:] else " was"
+        them = "them" if others[1:] else "it"
+        raise UserError(f"{others[0]}{what} not written by snarf fit; move {them}, or give overwrite=true to replace {them}")
 
 
 def _require_same(place: Path, made: FitMade, settings: dict[str, Any]) -> None:

@@ -19,7 +19,7 @@ from snarfcli.progress import progress
 from snarfcli.registration.body_surface import BodySurface
 from snarfcli.registration.fit_workers import find_single_frames
 from snarfcli.registration.fitter import Fitter, RigFitter
-from snarfcli.registration.same_topology import prepare_follower
+from snarfcli.registration.same_topology import NoUsualFrames, prepare_follower
 from snarfcli.registration.scan_files import topology_of
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import fit_shape
@@ -75,8 +75,8 @@ def decide_shape(subject: str, scans: SubjectScans, fitter: Fitter, settings: di
         what = "person" if scans.options.body.skeleton is None else "such body"
         raise UserError(
             f"no {what} in the scans of {subject}: in the best of {counted(len(seen), 'frame')} the body is "
-            f"{1000 * residual:.0f} mm from the points on average, wanted about 15; check data.scale (now {world.scale:g}) and "
-            f"data.up (now {world.up}), or give another body or skeleton"
+            f"{1000 * residual:.0f} mm from the points on average, wanted less than 20; check data.scale (now {world.scale:g}) "
+            f"and data.up (now {world.up}), or give another body or skeleton"
         )
     _check_others(subject, scans, world)
     _compare_sequences(scans, fitter.surface, seen)
@@ -106,7 +106,10 @@ def _shape(scans: SubjectScans, fitter: Fitter, world: FileToWorld, good: Sequen
         return shape.betas
     vertices = [scans.sequence(one.sequence, world).vertices(one.index) for one in good]
     faces = scans.sequence(good[0].sequence, world).faces()
-    return prepare_follower(fitter.whole, fitter.faces, faces, vertices, shape.states, clothes_m=clothes_m).betas
+    try:
+        return prepare_follower(fitter.whole, fitter.faces, faces, vertices, shape.states, clothes_m=clothes_m).betas
+    except NoUsualFrames:
+        return shape.betas
 
 
 def _by_own_vertices(scans: SubjectScans, fitter: Fitter, settings: dict[str, Any]) -> FitMade:

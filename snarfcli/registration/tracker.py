@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface
+from snarfcli.registration.fit_progress import FrameProgress
 from snarfcli.registration.fitted_sequence import Finder, FittedSequence, Found, Scans
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import different_frames, fit_shape
 from snarfcli.registration.solver import Agreement, PosePrior, agreement, fit_state, scales
-from snarfcli.registration.trust import find_jumps, is_suspicious, judge
+from snarfcli.registration.trust import apart_share, find_jumps, is_suspicious, judge
 
 __all__ = ["Finder", "FittedSequence", "Found", "Scans", "fit_sequence"]
 
@@ -37,6 +38,7 @@ _SAME = 3  # frames without gain after which following a better state ends
 _ALIKE = 3  # frames from which a suspicious one is fitted where frames have no order
 _LOOKS = 200  # points of a scan from which its look is made
 _ROUNDS = 3  # of fitting suspicious frames again
+_FIND_WORK = 20  # processor time of a search from nowhere, in that of a frame to which the body is followed
 _FINDS_PER_FRAME = 0.1  # searches from nowhere that a sequence may cost, per frame
 
 
@@ -61,18 +63,20 @@ def fit_sequence(
         betas: [S], shape parameters; without them one shape is fitted to this sequence.
         clothes_m: the body may be so far below the surface without cost, metres.
         is_ordered: each frame is close in time to its neighbours.
-        on_frame: is called with the number of each frame when it is done.
+        on_frame: is called with the number of each frame, in order, as the work on the whole sequence goes on.
 
     Raises:
         ValueError: there are no frames.
     """
     if not len(scans):
         raise ValueError("scans: wanted at least one frame, got none")
-    tracker = _Tracker(surface, scans, finder, prior, clothes_m)
     known = betas if surface.num_betas else np.zeros(0)
+    work = _expected_work(len(scans), shape_is_known=known is not None, is_ordered=is_ordered)
+    progress = FrameProgress(len(scans), work, len(scans), on_frame)
+    tracker = _Tracker(surface, scans, finder, prior, clothes_m, progress)
     if not is_ordered:
         tracker.find_each(known)
-        return tracker.polished(on_frame, is_ordered=False)
+        return tracker.polished(is_ordered=False)
     tracker.find_seeds(known, _SEEDS)
     tracker.follow_all()
     if known is None:
@@ -80,15 +84,31 @@ def fit_sequence(
     for _ in range(_ROUNDS):
         if not tracker.repair():
             break
-    return tracker.polished(on_frame)
+    return tracker.polished()
+
+
+def _expected_work(frames: int, *, shape_is_known: bool, is_ordered: bool) -> float:
+    """Return the work on a sequence without lost frames, in fits of one frame to which the body is followed."""
+    finds = min(_SEEDS, frames) if is_ordered else frames + (0 if shape_is_known else min(_SHAPE_FRAMES, frames))
+    rounds = 1 + is_ordered + (is_ordered and not shape_is_known)  # polished, followed, fitted again with the shape of all
+    return _FIND_WORK * finds + rounds * frames
 
 
 class _Tracker:
     """The best states of a sequence so far."""
 
-    def __init__(self, surface: BodySurface, scans: Scans, finder: Finder, prior: PosePrior, clothes_m: float) -> None:
+    def __init__(
+        self,
+        surface: BodySurface,
+        scans: Scans,
+        finder: Finder,
+        prior: PosePrior,
+        clothes_m: float,
+        progress: FrameProgress,
+    ) -> None:
         self.surface, self.coarse = surface, surface.take(np.arange(min(_VERTICES, len(surface.points_rest))))
         self.scans, self.finder, self.prior, self.clothes_m = scans, finder, prior, clothes_m
+        self.progress = progress
         self.betas = np.zeros(surface.num_betas)
         self.states: list[BodyState | None] = [None] * len(scans)
         self.misfit = np.full(len(scans), np.inf)
@@ -107,7 +127,7 @@ class _Tracker:
         """Fit a few frames from nowhere; without `betas`, give them a shape in common."""
         count = min(count, len(self.scans))
         self.seeds = [(2 * number + 1) * len(self.scans) // (2 * count) for number in range(count)]
-        found = [self.finder.find(self.scan(index), betas=betas, clothes_m=self.clothes_m).state for index in self.seeds]
+        found = [self._find(index, betas) for index in self.seeds]
         if betas is None:
             frames = [(self.scan(index), state) for index, state in zip(self.seeds, found, strict=True)]
             shape = fit_shape(self.coarse, frames, self.prior, clothes_m=self.clothes_m)
@@ -193,20 +213,23 @@ class _Tracker:
                 self.follow(worst)
         return bool((self.misfit[first : last + 1] < before).any())
 
-    def polished(self, on_frame: Callable[[int], None] | None, *, is_ordered: bool = True) -> FittedSequence:
+    def polished(self, *, is_ordered: bool = True) -> FittedSequence:
         """Fit all vertices to every frame, and judge the frames."""
-        states, agreements = [], []
+        self.progress.start_last()
+        states, agreements, apart = [], [], []
         for index in range(len(self.scans)):
             scan = self.scan(index)
             state = fit_state(self.surface, self._state(index), scan, _POLISH_M, self.prior, clothes_m=self.clothes_m)
             states.append(state)
             agreements.append(agreement(self.surface, state, scan, clothes_m=self.clothes_m))
-            if on_frame is not None:
-                on_frame(index)
+            apart.append(apart_share(agreements[-1], self.surface.points_rest, scan.points, self.clothes_m))
+            self.progress.add(1)
+        self.progress.finish()
         residual_m = np.array([one.residual_m for one in agreements])
         joints = np.stack([self.surface.joints(state) for state in states])
         jumps = find_jumps(joints) if is_ordered else np.full(len(states), -1)
-        reasons = judge(np.array([one.misfit for one in agreements]), residual_m, jumps, self.surface.joint_names)
+        misfit = np.array([one.misfit for one in agreements])
+        reasons = judge(misfit, residual_m, np.array(apart), jumps, self.surface.joint_names)
         return FittedSequence(
             np.stack([state.pose for state in states]),
             np.stack([state.translation for state in states]),
@@ -230,13 +253,20 @@ class _Tracker:
         return state, misfit
 
     def _found(self, index: int, near: Sequence[BodyState]) -> BodyState:
-        return self.finder.find(self.scan(index), betas=self.betas, clothes_m=self.clothes_m, near=near).state
+        return self._find(index, self.betas, near)
+
+    def _find(self, index: int, betas: Array | None, near: Sequence[BodyState] = ()) -> BodyState:
+        state = self.finder.find(self.scan(index), betas=betas, clothes_m=self.clothes_m, near=near).state
+        self.progress.add(_FIND_WORK)
+        return state
 
     def _usual(self) -> float:
         return float(np.median(self.misfit[np.isfinite(self.misfit)]))
 
     def _fitted(self, index: int, state: BodyState, scales_m: Array) -> BodyState:
-        return fit_state(self.coarse, state, self.scan(index), scales_m, self.prior, clothes_m=self.clothes_m)
+        state = fit_state(self.coarse, state, self.scan(index), scales_m, self.prior, clothes_m=self.clothes_m)
+        self.progress.add(1)
+        return state
 
     def _agreement(self, index: int, state: BodyState) -> Agreement:
         return agreement(self.coarse, state, self.scan(index), clothes_m=self.clothes_m)

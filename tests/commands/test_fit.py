@@ -253,6 +253,10 @@ def test_files_of_others_are_kept(tmp_path: Path, me: Path, quick: pytest.Monkey
     with pytest.raises(UserError, match=r"skeleton\.json and 1 more file were not written by snarf fit; .*overwrite=true"):
         fit.run(_config(tmp_path))
     assert _files(me) == {"skeleton.json", "walk/motion.bvh"}
+    (me / "skeleton.json").unlink()
+    with pytest.raises(UserError, match=r"motion\.bvh was not written by snarf fit; move it, or .* to replace it$"):
+        fit.run(_config(tmp_path))
+    (me / "skeleton.json").write_text("{}")
     fit.run(_config(tmp_path, overwrite=True))
     assert _files(me) == {"skeleton.npz", "fit.json", "fit.png", "run/poses.npz", "walk/poses.npz"}
 
@@ -261,7 +265,7 @@ def test_all_leaves_out_subjects_with_poses_of_others(
     tmp_path: Path, me: Path, quick: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (me / "skeleton.json").write_text("{}")
-    with pytest.raises(UserError, match="no scans in"):
+    with pytest.raises(UserError, match=r"nothing to fit in .*meshes; wanted <subject>"):
         fit.run(_config(tmp_path, subject="all"))
     assert "left out: subject me, which has a skeleton or poses that snarf fit has not written" in caplog.text
     write_scans(tmp_path / "meshes" / "you" / "walk", 2, one_topology=True)

@@ -12,7 +12,14 @@ import torch
 
 from snarfcli.bodies import builtin_body
 from snarfcli.registration.body_surface import BodyState, BodySurface
-from snarfcli.registration.same_topology import OTHERS, EdgeLengths, fit_one_topology, is_own_topology, prepare_follower
+from snarfcli.registration.same_topology import (
+    OTHERS,
+    EdgeLengths,
+    NoUsualFrames,
+    fit_one_topology,
+    is_own_topology,
+    prepare_follower,
+)
 
 BETAS = np.array([1.0, -1.0, 0.5, 0.5] + [0.0] * 6)
 FRAMES = 12
@@ -93,6 +100,14 @@ def test_another_topology_needs_a_known_pose(surface, other):
     vertices, faces = other
     with pytest.raises(ValueError, match="states: wanted those of some frames"):
         fit_one_topology(surface, FACES, faces, lambda frame: vertices[frame], FRAMES, {})
+
+
+def test_a_known_pose_of_other_vertices_is_none(surface, other, true):
+    vertices, faces = other
+    mixed = list(vertices)
+    mixed[0] = vertices[0][::-1]
+    with pytest.raises(NoUsualFrames, match="states: wanted those of some frames"):
+        fit_one_topology(surface, FACES, faces, lambda frame: mixed[frame], FRAMES, {0: true[0]}, betas=BETAS)
 
 
 def test_permuted_and_other_frames_are_noticed_and_fitted_alone(surface, frames, true):

@@ -44,7 +44,7 @@ def test_a_frame_of_an_unknown_motion_is_found_without_its_shape(finder, motion,
     truth = turned_frame(motion, time_s, yaw)
     found = finder.find(body_scan(truth))
     assert errors_m(finder, found.state, truth).mean() < 0.010  # measured 0.004
-    assert found.agreement.residual_m < 0.03  # the points are about 2 cm apart
+    assert found.agreement.residual_m < 0.005  # the points are about 2 cm apart
 
 
 def test_a_given_shape_is_kept(finder):

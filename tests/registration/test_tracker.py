@@ -44,7 +44,7 @@ def test_pose_and_shape_are_found_through_a_sequence(person):
     assert fitted.poses.shape == (12, 24, 3)
     assert fitted.reasons == ("",) * 12
     assert seen == list(range(12))
-    assert np.abs(fitted.residual_m - 0.02).max() < 0.01  # the spacing of points and vertices
+    assert fitted.residual_m.max() < 0.005  # measured 0.004, with vertices 6 cm apart
 
 
 def test_a_wrong_start_does_not_spoil_the_sequence(person):

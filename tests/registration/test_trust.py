@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from snarfcli.registration.trust import find_jumps, is_suspicious, judge, usual_misfit
+from snarfcli.registration.solver import Agreement
+from snarfcli.registration.trust import apart_share, find_jumps, is_suspicious, judge, usual_misfit
 
 NAMES = ("root", "hand")
 
@@ -46,9 +48,31 @@ def test_a_long_lost_stretch_does_not_become_usual():
 def test_reasons_are_plain_words():
     misfit, residual = np.full(10, 0.04), np.full(10, 0.012)
     misfit[3], residual[3] = 0.1, 0.031
+    apart = np.full(10, 0.003)
+    apart[9] = 0.06
     jumps = np.full(10, -1)
     jumps[[4, 7]] = 1  # that of frame 4 comes from its neighbour
-    reasons = judge(misfit, residual, jumps, NAMES)
+    reasons = judge(misfit, residual, apart, jumps, NAMES)
     assert reasons[3] == "the body is 31.0 mm from the points; usual in this sequence: 12.0 mm"
     assert reasons[7] == "joint hand jumps between this frame and its neighbours"
-    assert [index for index, reason in enumerate(reasons) if reason] == [3, 7]
+    assert [index for index, reason in enumerate(reasons) if reason] == [3, 7, 9]
+    assert reasons[9] == "6 % of the body and of the points are far from each other"
+
+
+def test_a_sequence_that_is_lost_from_end_to_end_is_not_trusted():
+    misfit, residual, apart = np.full(10, 0.13), np.full(10, 0.006), np.full(10, 0.08)
+    assert all(judge(misfit, residual, apart, np.full(10, -1), NAMES))
+    assert not any(judge(misfit, residual, np.zeros(10), np.full(10, -1), NAMES))
+    apart[6:] = 0.02
+    assert judge(misfit, residual, apart, np.full(10, -1), NAMES)[6:] == ("most frames of this sequence are lost",) * 4
+
+
+@pytest.mark.parametrize(("of_body", "of_scan", "share"), [(0.2, 0.1, 0.1), (0.0, 0.3, 0.0), (0.3, 0.0, 0.0)])
+def test_only_what_both_sides_miss_is_apart(of_body, of_scan, share):
+    body, seen = (np.where(np.arange(100) < 100 * part, 0.2, 0.01) for part in (of_body, of_scan))
+    found = Agreement(0.2, 0.04, 0.002, body, seen, np.zeros(100, np.intp))
+    grid = 0.02 * np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0), [0.0]), -1).reshape(-1, 3)
+    assert apart_share(found, grid, grid) == pytest.approx(share)
+    assert apart_share(found, grid, grid, clothes_m=0.15) == 0
+    assert apart_share(found, grid, 4 * grid) == 0  # so few points are far from all
+    assert apart_share(found, 7 * grid, grid) == 0

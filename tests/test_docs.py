@@ -13,11 +13,13 @@ import torch
 from documents import python_examples, run_examples
 from small_human import small_human
 
+import snarfcli.motions
 from snarfcli.avatar import Avatar
 from snarfcli.cli.command_list import COMMANDS
 from snarfcli.cli.flags import translate_flags
 from snarfcli.errors import UserError
 from snarfcli.hydra_config.overrides import check_overrides
+from snarfcli.motions import Motion, builtin_motion
 
 ROOT = Path(__file__).parents[1]
 README, PYTHON = ROOT / "README.md", ROOT / "docs/python.md"
@@ -37,8 +39,14 @@ def demo(avatar, tmp_path, monkeypatch) -> Path:
     np.savez(
         tmp_path / "walk.npz", poses=0.1 * np.sin(np.arange(216).reshape(3, 72)), trans=np.zeros((3, 3)), mocap_framerate=30
     )
+    monkeypatch.setattr(snarfcli.motions, "builtin_motion", short_motion)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def short_motion(name: str, seed: int, *, frame_rate: float = 60.0) -> Motion:
+    """Return the first frames of a built-in motion."""
+    return builtin_motion(name, seed, frame_rate=frame_rate).slice(stop=8)
 
 
 def test_the_programs_of_the_readme_run(demo):

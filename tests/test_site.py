@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import room_graph
+from chromium_page import needs_chromium, opened
 from configuration import configuration_page
 from links import rewrite_links
 from pages import API_ROOMS, page_of, project_pages
@@ -143,3 +144,12 @@ def test_the_search_of_the_site_knows_its_pages(site):
         "configuration.html",
     ):
         assert f'"location":"{place}' in index
+
+
+@needs_chromium
+def test_search_finds_pages_of_a_site_on_the_disk(site, tmp_path):
+    """There browsers allow no workers; docs/site/iframe-worker.js stands in for them."""
+    with opened(f"{(site / 'index.html').as_uri()}?q=broyden", tmp_path) as page:
+        page.wait("document.querySelectorAll('.md-search-result__item').length > 3")
+        assert page.complaints == []
+        assert all(address.startswith(("file:", "data:", "about:", "blob:")) for address in page.requests)

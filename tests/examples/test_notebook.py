@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 from run_notebook import cells, run_notebook
 
+import snarfcli.motions
+from snarfcli.motions import builtin_motion
+
 ROOT = Path(__file__).parents[2]
 NOTEBOOK = ROOT / "examples/first_avatar.ipynb"
 FRAMES = "data.frame_step=40 data.test_frame_step=40 data.ood_frame_step=100"
@@ -25,8 +28,15 @@ def test_it_is_stored_without_results():
 def test_it_runs_from_top_to_bottom(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setattr(snarfcli.motions, "builtin_motion", lambda *args, **more: builtin_motion(*args, **more).slice(stop=4))
     names = run_notebook(
-        NOTEBOOK, {"training": "smoke", "samples": LESS, "measures": "figure_frames=1 figure_resolution=48", "resolution": 48}
+        NOTEBOOK,
+        {
+            "training": "smoke training.steps=20",
+            "samples": LESS,
+            "measures": "figure_frames=1 figure_resolution=48",
+            "resolution": 48,
+        },
     )
     run = tmp_path / "first_avatar/outputs/builtin/50002/first"
     assert {"avatar.pt", "eval_id", "eval_ood", "character.glb", "character.html"} <= {path.name for path in run.iterdir()}

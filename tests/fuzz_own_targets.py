@@ -351,7 +351,7 @@ def _fitted(folder: Path) -> Any:
 
     from snarfcli.bodies import builtin_body
     from snarfcli.datasets.recorded_sequence import FileToWorld
-    from snarfcli.registration.written import FitMade, FittedFile, write_fitted, write_skeleton
+    from snarfcli.scanned_subjects.written import FitMade, FittedFile, write_fitted, write_skeleton
 
     made = FitMade(BETAS, FileToWorld(0.01, "z"), {"seed": 0})
     poses, places = toy_poses(2)
@@ -365,7 +365,7 @@ def fitted_skeleton() -> Target:
     """The skeleton that `snarf fit` has written, which it continues."""
     from tree_damage import damaged_npz
 
-    from snarfcli.registration.written import foreign_files, read_made
+    from snarfcli.scanned_subjects.written import foreign_files, read_made
 
     def seeds() -> list[bytes]:
         with tempfile.TemporaryDirectory() as folder:
@@ -391,8 +391,8 @@ def fitted_poses() -> Target:
     from tree_damage import damaged_npz
 
     from snarfcli.bodies import builtin_body
-    from snarfcli.registration.fit_report import SequenceReport
-    from snarfcli.registration.written import read_fitted
+    from snarfcli.scanned_subjects.fit_report import SequenceReport
+    from snarfcli.scanned_subjects.written import read_fitted
 
     with tempfile.TemporaryDirectory() as folder:
         made, _ = _fitted(Path(folder))
@@ -419,7 +419,7 @@ def fit_report() -> Target:
     from tree_damage import damaged_json
 
     from snarfcli.bodies import builtin_body
-    from snarfcli.registration.fit_report import SequenceReport, report_remarks, write_fit_report
+    from snarfcli.scanned_subjects.fit_report import SequenceReport, report_remarks, write_fit_report
 
     with tempfile.TemporaryDirectory() as folder:
         made, fitted = _fitted(Path(folder))

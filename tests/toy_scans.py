@@ -15,8 +15,8 @@ from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.solver import PosePrior, agreement, fit_state, scales
 from snarfcli.registration.starts import Found, PoseFinder
-from snarfcli.registration.written import read_fitted, read_made
 from snarfcli.sampling import oriented_surface_samples
+from snarfcli.scanned_subjects.written import read_fitted, read_made
 
 BETAS = np.array([1.0, -0.8, 0.5, 0.7, 0, 0, 0, 0, 0, 0])
 Cloud = tuple[np.ndarray, np.ndarray]

@@ -130,8 +130,8 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
     from snarfcli.datasets.registry import find_dataset
     from snarfcli.datasets.sources import Request
     from snarfcli.datasets.subjects import SubjectData
-    from snarfcli.registration.fit_report import fit_remarks
     from snarfcli.rendering.bones import write_bones_figure
+    from snarfcli.scanned_subjects.fit_report import fit_remarks
 
     request = Request(data, Path(config.data_root), config.body)
     subjects = [config.subject] if config.subject not in (None, "all") else list(find_dataset(data.name).subjects(request))

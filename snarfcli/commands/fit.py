@@ -21,14 +21,14 @@ from snarfcli.errors import UserError
 
 if TYPE_CHECKING:
     from snarfcli.datasets.sources import Request
-    from snarfcli.registration.fit_options import FitOptions
+    from snarfcli.scanned_subjects.fit_options import FitOptions
 
 __all__ = ["FitConfig", "run"]
 
 log = logging.getLogger(__name__)
 
 _CLOTHES_M = 0.04  # below a shirt and trousers
-_LOOSEST_M = 0.2
+_LOOSEST_M = 0.06  # with more the search for a pose, which does not know of clothes, goes wrong
 _POINTS = (500, 100_000)
 _FRAME_RATES = (0.01, 1000.0)
 _GENDERS = ("neutral", "female", "male")
@@ -83,7 +83,7 @@ def run(config: FitConfig) -> int:
     """
     from snarfcli.datasets.mesh_folders import meshes_folder
     from snarfcli.datasets.sources import Request
-    from snarfcli.registration.subject_fit import fit_subject
+    from snarfcli.scanned_subjects.subject_fit import fit_subject
 
     options = _options(config)
     request = Request(config.data, Path(config.data_root), config.body)
@@ -99,8 +99,8 @@ def run(config: FitConfig) -> int:
 
 def _without_poses(request: Request, overwrite: bool) -> Iterator[str]:
     """Yield the subjects that have scans and no skeleton or poses of others."""
-    from snarfcli.registration.scans import find_scans, scan_subjects
-    from snarfcli.registration.written import foreign_files
+    from snarfcli.scanned_subjects.scans import find_scans, scan_subjects
+    from snarfcli.scanned_subjects.written import foreign_files
 
     for subject in scan_subjects(request):
         try:
@@ -118,8 +118,8 @@ def _options(config: FitConfig) -> FitOptions:
     """Check all settings before any work starts."""
     from snarfcli.datasets.recorded_sequence import check_scale
     from snarfcli.parallel import count_cores
-    from snarfcli.registration.fit_options import FitOptions
-    from snarfcli.registration.fitter import BodyChoice
+    from snarfcli.scanned_subjects.fit_options import FitOptions
+    from snarfcli.scanned_subjects.fitter import BodyChoice
 
     if config.data.name != "meshes":
         raise UserError(f"data: wanted meshes, got {config.data.name}, which has poses already; give data=meshes")

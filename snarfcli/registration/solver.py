@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface
-from snarfcli.registration.rotations import matrix_to_vector
 from snarfcli.registration.scan_points import ScanPoints, with_normals
 
 __all__ = [
     "SHAPE_PRIOR",
     "Agreement",
     "PosePrior",
-    "Pull",
     "StepOptions",
     "agreement",
     "equations",
@@ -89,15 +87,6 @@ class PosePrior:
 
 
 @dataclass(frozen=True)
-class Pull:
-    """A state to stay near to, such as that of a neighbour in time; only the turns of joints count."""
-
-    state: BodyState
-    weight: float
-    """Squared metres per squared radian."""
-
-
-@dataclass(frozen=True)
 class StepOptions:
     """What a step may change, and how it weighs matches."""
 
@@ -105,7 +94,6 @@ class StepOptions:
     """Distance at which a match has a quarter of its weight, metres."""
     shape_is_free: bool = False
     """Change the shape parameters, too."""
-    pull: Pull | None = None
     clothes_m: float = 0.0
     """The body is inside the scan: it may be so far below the surface without cost, metres."""
 
@@ -154,12 +142,11 @@ def fit_state(
     prior: PosePrior,
     *,
     shape_is_free: bool = False,
-    pull: Pull | None = None,
     clothes_m: float = 0.0,
 ) -> BodyState:
     """Take one step per scale; arguments as in `step` and `StepOptions`."""
     for scale in scales_m:
-        state = step(surface, state, scan, prior, StepOptions(float(scale), shape_is_free, pull, clothes_m))
+        state = step(surface, state, scan, prior, StepOptions(float(scale), shape_is_free, clothes_m))
     return state
 
 
@@ -199,8 +186,6 @@ def equations(
     weights, pulls = _by_vertex(_match(posed, scan), len(posed.points), options)
     system, gradient = derivatives.normal_equations(weights, pulls)
     _add_prior(system, gradient, surface, state, posed, prior)
-    if options.pull is not None:
-        _add_pull(system, gradient, state, posed, options.pull)
     system[np.diag_indices(len(system))] += _DAMPING * np.trace(system) / len(system)
     return posed, system, gradient
 
@@ -319,13 +304,6 @@ def _add_prior(
         block, axes = slice(3 * joint, 3 * joint + 3), posed.turns[parent]
         system[block, block] += (axes * prior.weight[joint]) @ axes.T
         gradient[block] += axes @ (prior.weight[joint] * deviation[joint])
-
-
-def _add_pull(system: Array, gradient: Array, state: BodyState, posed: PosedSurface, pull: Pull) -> None:
-    """Add the cost of joints that are turned otherwise than in the state to stay near to."""
-    apart = matrix_to_vector(pull.state.rotations.transpose(0, 2, 1) @ state.rotations)
-    gradient[: apart.size] += pull.weight * (posed.turns @ apart[..., None]).reshape(-1)
-    system[np.arange(apart.size), np.arange(apart.size)] += pull.weight
 
 
 def _at_most(vectors: Array, longest: float) -> Array:

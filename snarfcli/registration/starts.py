@@ -73,7 +73,7 @@ class _Frame:
 
     def judged(self, state: BodyState) -> Found:
         """Return the state with its agreement."""
-        return Found(state, agreement(self.surface, state, self.scan))
+        return Found(state, agreement(self.surface, state, self.scan, clothes_m=self.clothes_m))
 
     def followed(self, state: BodyState, steps: int, scales_m: tuple[float, float]) -> Found:
         """Return the state after some steps of a few vertices."""

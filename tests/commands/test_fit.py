@@ -22,8 +22,8 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError
 from snarfcli.output_locks import hold_output
-from snarfcli.registration import fit_figure, fitter, subject_fit, subject_scans, subject_shape
 from snarfcli.sampling import oriented_surface_samples
+from snarfcli.scanned_subjects import fit_figure, fitter, subject_fit, subject_scans, subject_shape
 
 ACCURATE_MM = 10.0  # measured 3 to 6, with 300 vertices and 1,000 points
 
@@ -329,8 +329,8 @@ def test_several_persons_and_different_persons(
     [
         ({"data": DataConfig("builtin", 1, 1, 1)}, "data: wanted meshes, got builtin, which has poses already"),
         ({"subject": "you"}, "no subject 'you' in .*; wanted one of me"),
-        ({"clothes": "thick"}, "clothes: wanted true, false or 0 to 0.2 metres, got 'thick'"),
-        ({"clothes": "0.5"}, "clothes: wanted true, false or 0 to 0.2 metres"),
+        ({"clothes": "thick"}, "clothes: wanted true, false or 0 to 0.06 metres, got 'thick'"),
+        ({"clothes": "0.5"}, "clothes: wanted true, false or 0 to 0.06 metres"),
         ({"ordered": "yes"}, "ordered: wanted auto, true or false"),
         ({"points_per_frame": 100}, "points_per_frame: wanted 500 to 100000, got 100"),
         ({"frame_rate": 0.0}, "frame_rate: wanted"),

@@ -82,6 +82,7 @@ for path in sorted(folder.rglob("*.py")):
         "export",
         "fitting",
         "registration",
+        "scanned_subjects",
         "meshing",
         "motions",
         "rendering",

@@ -10,7 +10,7 @@ import trimesh
 from snarfcli.bodies import builtin_body
 from snarfcli.registration.body_surface import BodyState, BodySurface
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import PosePrior, Pull, agreement, fit_state, scales
+from snarfcli.registration.solver import PosePrior, agreement, fit_state, scales
 
 PRIOR = PosePrior.weak(24)
 
@@ -65,14 +65,6 @@ def test_rotations_stay_rotations(surface, truth, scan):
     np.testing.assert_allclose(
         found.rotations.transpose(0, 2, 1) @ found.rotations, np.broadcast_to(np.eye(3), (24, 3, 3)), atol=1e-12
     )
-
-
-def test_a_strong_pull_keeps_the_pose(surface, truth, scan):
-    start = BodyState.from_pose(np.zeros((24, 3)), truth.translation, truth.betas)
-    free = fit_state(surface, start, scan, scales(0.1, 0.03, 5), PRIOR)
-    kept = fit_state(surface, start, scan, scales(0.1, 0.03, 5), PRIOR, pull=Pull(start, 100.0))
-    assert np.abs(free.pose).max() > 0.3
-    assert np.abs(kept.pose).max() < 0.01
 
 
 def test_a_strong_prior_leads_to_its_mean(surface, truth, scan):

@@ -83,3 +83,12 @@ def test_a_wrong_arm_is_found_again(finder):
     assert errors_m(finder, lost, truth).max() > 0.2
     assert errors_m(finder, found.state, truth).mean() < 0.010
     np.testing.assert_array_equal(found.state.betas, truth.betas)
+
+
+def test_clothes_do_not_count_as_misfit(finder):
+    truth = turned_frame("punching", 1.0, 1.0)
+    bare = body_scan(truth)
+    clothed = ScanPoints(bare.points + 0.03 * bare.normals, bare.normals)
+    found = finder.find(clothed, betas=BETAS, clothes_m=0.04)
+    assert errors_m(finder, found.state, truth).mean() < 0.020
+    assert found.agreement.misfit < 0.1  # measured 0.03; 0.5 without the clothes

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from snarfcli.registration.fitter import BodyChoice
+from snarfcli.scanned_subjects.fitter import BodyChoice
 
 __all__ = ["FitOptions"]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from snarfcli.bodies import builtin_body
-from snarfcli.registration import fit_workers
 from snarfcli.registration.body_surface import BodyState, BodySurface
+from snarfcli.scanned_subjects import fit_workers
 
 
 class Scans:

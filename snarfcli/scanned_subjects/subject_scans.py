@@ -12,11 +12,11 @@ from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.errors import UserError
 from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
-from snarfcli.registration.fit_options import FitOptions
-from snarfcli.registration.fitter import Fitter, RigFitter
-from snarfcli.registration.scan_files import ScanFacts, examine_files, read_scan
-from snarfcli.registration.scans import ScanFolder, ScanSequence
-from snarfcli.registration.survey import Sample, Survey, survey_samples
+from snarfcli.scanned_subjects.fit_options import FitOptions
+from snarfcli.scanned_subjects.fitter import Fitter, RigFitter
+from snarfcli.scanned_subjects.scan_files import ScanFacts, examine_files, read_scan
+from snarfcli.scanned_subjects.scans import ScanFolder, ScanSequence
+from snarfcli.scanned_subjects.survey import Sample, Survey, survey_samples
 from snarfcli.texts import counted
 
 __all__ = ["SubjectScans", "read_subject"]

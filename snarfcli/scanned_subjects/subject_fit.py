@@ -15,17 +15,17 @@ from snarfcli.files import remove_temporaries
 from snarfcli.output_locks import hold_output
 from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
-from snarfcli.registration.fit_figure import write_fit_figure
-from snarfcli.registration.fit_options import FitOptions
-from snarfcli.registration.fit_report import FIGURE, REPORT, SequenceReport, write_fit_report
-from snarfcli.registration.fit_workers import SequenceTask, fit_sequences
-from snarfcli.registration.fitter import Fitter, RigFitter, load_fitter
-from snarfcli.registration.scan_files import ScanFacts, fingerprint
-from snarfcli.registration.scans import ScanFolder, find_scans
-from snarfcli.registration.subject_scans import SubjectScans, read_subject
-from snarfcli.registration.subject_shape import decide_shape, resized, rig_size
 from snarfcli.registration.tracker import FittedSequence
-from snarfcli.registration.written import (
+from snarfcli.scanned_subjects.fit_figure import write_fit_figure
+from snarfcli.scanned_subjects.fit_options import FitOptions
+from snarfcli.scanned_subjects.fit_report import FIGURE, REPORT, SequenceReport, write_fit_report
+from snarfcli.scanned_subjects.fit_workers import SequenceTask, fit_sequences
+from snarfcli.scanned_subjects.fitter import Fitter, RigFitter, load_fitter
+from snarfcli.scanned_subjects.scan_files import ScanFacts, fingerprint
+from snarfcli.scanned_subjects.scans import ScanFolder, find_scans
+from snarfcli.scanned_subjects.subject_scans import SubjectScans, read_subject
+from snarfcli.scanned_subjects.subject_shape import decide_shape, resized, rig_size
+from snarfcli.scanned_subjects.written import (
     LONGEST_REASON,
     FitMade,
     FittedFile,

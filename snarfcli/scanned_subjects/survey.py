@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from snarfcli.checks import alternatives
 from snarfcli.datasets.recorded_sequence import person_scale
 from snarfcli.errors import UserError
-from snarfcli.registration.surroundings import AXES, Floor, Part, find_floor, find_parts, robust_box, without_surroundings
+from snarfcli.scanned_subjects.surroundings import AXES, Floor, Part, find_floor, find_parts, robust_box, without_surroundings
 
 __all__ = ["Sample", "Survey", "survey_samples"]
 

@@ -12,12 +12,12 @@ from scipy.spatial import KDTree
 
 from snarfcli.meshing.mesh import Mesh
 from snarfcli.registration.body_surface import BodyState
-from snarfcli.registration.fit_report import SequenceReport
-from snarfcli.registration.fitter import Fitter
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.subject_scans import SubjectScans
-from snarfcli.registration.written import FitMade
 from snarfcli.rendering import Camera, contact_sheet, render, write_png
+from snarfcli.scanned_subjects.fit_report import SequenceReport
+from snarfcli.scanned_subjects.fitter import Fitter
+from snarfcli.scanned_subjects.subject_scans import SubjectScans
+from snarfcli.scanned_subjects.written import FitMade
 from snarfcli.texts import one_line
 
 __all__ = ["write_fit_figure"]

@@ -16,7 +16,7 @@ from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.files import write_arrays
-from snarfcli.registration.written import (
+from snarfcli.scanned_subjects.written import (
     FitMade,
     FittedFile,
     foreign_files,

@@ -17,8 +17,8 @@ from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError
 from snarfcli.files import read_json, write_json
 from snarfcli.registration.joint_limits import near_limits
-from snarfcli.registration.scans import scan_subjects
-from snarfcli.registration.written import FitMade, FittedFile
+from snarfcli.scanned_subjects.scans import scan_subjects
+from snarfcli.scanned_subjects.written import FitMade, FittedFile
 from snarfcli.texts import counted, one_line
 from snarfcli.versions import recorded_code, recorded_versions
 

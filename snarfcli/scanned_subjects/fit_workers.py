@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from snarfcli.registration.body_surface import BodyState
-from snarfcli.registration.fitter import BodyChoice, Fitter, load_fitter
 from snarfcli.registration.same_topology import NoUsualFrames, fit_one_topology, is_own_topology
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.scans import ScanSequence
 from snarfcli.registration.starts import Found
 from snarfcli.registration.tracker import FittedSequence, fit_sequence
+from snarfcli.scanned_subjects.fitter import BodyChoice, Fitter, load_fitter
+from snarfcli.scanned_subjects.scans import ScanSequence
 
 __all__ = ["SequenceTask", "find_single_frames", "fit_sequences", "is_in_order"]
 

@@ -17,16 +17,16 @@ from snarfcli.motions.up_axis import up_axis
 from snarfcli.parallel import run_in_processes
 from snarfcli.progress import progress
 from snarfcli.registration.body_surface import BodySurface
-from snarfcli.registration.fit_workers import find_single_frames
-from snarfcli.registration.fitter import Fitter, RigFitter
 from snarfcli.registration.same_topology import NoUsualFrames, prepare_follower
-from snarfcli.registration.scan_files import topology_of
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import fit_shape
 from snarfcli.registration.starts import Found
-from snarfcli.registration.subject_scans import SubjectScans
-from snarfcli.registration.surroundings import AXES
-from snarfcli.registration.written import FitMade
+from snarfcli.scanned_subjects.fit_workers import find_single_frames
+from snarfcli.scanned_subjects.fitter import Fitter, RigFitter
+from snarfcli.scanned_subjects.scan_files import topology_of
+from snarfcli.scanned_subjects.subject_scans import SubjectScans
+from snarfcli.scanned_subjects.surroundings import AXES
+from snarfcli.scanned_subjects.written import FitMade
 from snarfcli.texts import counted
 
 __all__ = ["decide_shape", "resized", "rig_size"]

@@ -18,10 +18,10 @@ from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError
 from snarfcli.files import write_arrays
-from snarfcli.registration.scan_files import FEWEST_POINTS, examine_files, fingerprint, read_scan
-from snarfcli.registration.scans import ScanSequence, find_scans, scan_subjects
-from snarfcli.registration.surroundings import Floor
 from snarfcli.sampling import oriented_surface_samples
+from snarfcli.scanned_subjects.scan_files import FEWEST_POINTS, examine_files, fingerprint, read_scan
+from snarfcli.scanned_subjects.scans import ScanSequence, find_scans, scan_subjects
+from snarfcli.scanned_subjects.surroundings import Floor
 
 
 def request(root: Path, folder: Path | None = None) -> Request:

@@ -20,9 +20,9 @@ from snarfcli.datasets.sources import Request
 from snarfcli.errors import UserError, nearest
 from snarfcli.formats.surfaces import read_surface
 from snarfcli.names import folder_names
-from snarfcli.registration.scan_files import read_scan
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.surroundings import Floor, without_surroundings
+from snarfcli.scanned_subjects.scan_files import read_scan
+from snarfcli.scanned_subjects.surroundings import Floor, without_surroundings
 
 __all__ = ["ScanFolder", "ScanSequence", "find_scans", "scan_subjects"]
 

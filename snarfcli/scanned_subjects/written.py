@@ -22,7 +22,7 @@ from snarfcli.datasets.mesh_folders import POSE_FILES, skeleton_files
 from snarfcli.datasets.recorded_sequence import FileToWorld
 from snarfcli.errors import UserError
 from snarfcli.files import write_arrays
-from snarfcli.registration.surroundings import AXES
+from snarfcli.scanned_subjects.surroundings import AXES
 from snarfcli.texts import one_line
 
 __all__ = [

@@ -7,7 +7,7 @@ import pytest
 from toy_scans import Z_UP, floor, person, together
 
 from snarfcli.errors import UserError
-from snarfcli.registration.survey import Sample, survey_samples
+from snarfcli.scanned_subjects.survey import Sample, survey_samples
 
 BODY_M = 1.75
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from toy_scans import Z_UP, floor, person, together
 
-from snarfcli.registration.surroundings import find_floor, find_parts, robust_box, without_surroundings
+from snarfcli.scanned_subjects.surroundings import find_floor, find_parts, robust_box, without_surroundings
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])

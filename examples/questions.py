@@ -46,7 +46,12 @@ def sides(avatar: Avatar, points: Tensor, pose: Tensor) -> Tensor:
 
 def correspondences(avatar: Avatar, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return all roots: canonical points [M, 3], the point [M] each belongs to, and Jacobians [M, 3, 3] of forward skinning."""
-    found = avatar.find(points, avatar.bone_transforms(pose), pose).roots
+    from snarfcli.models.fast_snarf import FoundRoots
+
+    answer = avatar.find(points, avatar.bone_transforms(pose), pose)
+    if not isinstance(answer, FoundRoots):
+        raise ValueError("wanted an avatar with forward skinning (model=fast_snarf or snarf)")
+    found = answer.roots
     return found.canonical, found.query, torch.linalg.inv(found.jacobian_inverse)
 
 

@@ -31,7 +31,7 @@ def surface() -> tuple[Array, NDArray[np.int64]]:
     angle = np.linspace(0, 2 * math.pi, SIDES, endpoint=False)
     height = np.repeat(JOINTS * LENGTH * share, SIDES)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    x, z = (np.outer(radius, one).ravel() for one in circle)
+    x, z = ((radius[:, None] * one).ravel() for one in circle)
     ends = np.array([[0.0, 0.0, 0.0], [0.0, JOINTS * LENGTH, 0.0]])
     a = np.arange(SIDES * (RINGS - 1)).reshape(RINGS - 1, SIDES)
     b, c, d = np.roll(a, -1, 1), a + SIDES, np.roll(a, -1, 1) + SIDES
@@ -39,7 +39,8 @@ def surface() -> tuple[Array, NDArray[np.int64]]:
     parts = [np.stack([a, c, b], 2).reshape(-1, 3), np.stack([b, c, d], 2).reshape(-1, 3)]
     parts.append(np.stack([first, np.roll(first, -1), np.full(SIDES, count)], 1))
     parts.append(np.stack([np.roll(last, -1), last, np.full(SIDES, count + 1)], 1))
-    return np.concatenate([np.stack([x, height, z], 1), ends]), np.concatenate(parts)
+    vertices: Array = np.concatenate([np.stack([x, height, z], 1), ends])
+    return vertices, np.concatenate(parts)
 
 
 def weights(vertices: Array) -> Array:

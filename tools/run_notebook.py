@@ -63,7 +63,7 @@ def _command(line: str, names: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Run the code of a notebook from top to bottom.")
     parser.add_argument("notebook", type=Path)
     parser.add_argument("values", nargs="*", metavar="NAME=VALUE", help="for variables of the first cell")
     options = parser.parse_args()

@@ -14,6 +14,7 @@ import pytest
 import room_graph
 from chromium_page import needs_chromium, opened
 from configuration import configuration_page
+from filelock import FileLock
 from links import rewrite_links
 from pages import API_ROOMS, page_of, project_pages
 
@@ -100,16 +101,26 @@ def test_flowcharts_become_pictures():
         room_graph.draw_graphs("```mermaid\nflowchart TD\n    x --> [y]\n```\n")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def site(tmp_path_factory) -> Path:
+    """The site, built once for all processes of the test run."""
     if importlib.util.find_spec("mkdocs") is None or importlib.util.find_spec("mkdocstrings") is None:
         pytest.skip("needs the packages of the extra docs")
-    folder = tmp_path_factory.mktemp("site")
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "site"
+    with FileLock(f"{folder}.lock"):
+        built = folder.with_suffix(".built")
+        if not built.exists():
+            build_site(folder)
+            built.touch()
+    return folder
+
+
+def build_site(folder: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder), "-f", str(ROOT / "mkdocs.yml")]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "true", "NO_COLOR": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
-    return folder
 
 
 def test_the_site_builds_without_warnings_and_loads_nothing(site):

@@ -9,13 +9,15 @@ SUBJECT ?= 50002
 NATIVE := $(wildcard csrc/cpu/*.cpp csrc/cpu/*.h csrc/include/snarf/*.h)
 C_FAMILY = $(shell find csrc benchmarks tests/native tests/pretend_gpu tests/trust -name '*.c' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu' -o -name '*.cuh')
 
-.PHONY: help setup demo test lowest platforms wheels fuzz trust sanitize lint format bench gpu clean
+.PHONY: help setup demo test lowest docs notebook platforms wheels fuzz trust sanitize lint format bench gpu clean
 
 help:
 	@echo "make setup     install snarf into $(VENV)"
 	@echo "make demo      run the whole pipeline on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
 	@echo "make test      run the tests"
 	@echo "make lowest    run the tests of files, samples, pictures and commands with the oldest packages that pyproject.toml allows"
+	@echo "make docs      build the documentation as a site, in build/site"
+	@echo "make notebook  run the notebook of examples/ as it stands, in about ten minutes"
 	@echo "make platforms resolve the packages for every Python and platform, and write docs/platforms.md"
 	@echo "make wheels    build wheels for this platform with cibuildwheel, and try them"
 	@echo "make fuzz      read 20,000 damaged files with every file reader, 5,000 with slow ones"
@@ -47,6 +49,15 @@ test: $(INSTALLED)
 
 lowest:
 	tools/test_lowest.sh $(PYTHON)
+
+docs: $(INSTALLED)
+	NO_MKDOCS_2_WARNING=true $(VENV)/bin/python -m mkdocs build --quiet --strict
+	@echo "site: build/site/index.html"
+
+notebook: export OMP_WAIT_POLICY = PASSIVE
+notebook: $(INSTALLED)
+	mkdir -p build/notebook
+	cd build/notebook && $(abspath $(VENV))/bin/python $(CURDIR)/tools/run_notebook.py $(CURDIR)/examples/first_avatar.ipynb
 
 platforms: build/packaging
 	build/packaging/bin/python tools/platforms.py

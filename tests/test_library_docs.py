@@ -132,13 +132,3 @@ def test_what_a_page_names_exists(page):
     functions = set(re.findall(r"`(find_\w+|blended_matrices|inverse_skin|[A-Z]\w+Config)\(?", text))
     assert functions
     assert {name for name in functions if not hasattr(snarfcli.deformer, name) and not hasattr(snarfcli, name)} == set()
-
-
-@pytest.mark.parametrize("page", [LIBRARY, FAST_SNARF, DOCS.parent / "README.md"], ids=lambda page: page.stem)
-def test_every_link_within_the_project_leads_somewhere(page):
-    for target, anchor in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", page.read_text()):
-        file = page.parent / target if target else page
-        assert file.exists(), target
-        if anchor:
-            headings = re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)
-            assert anchor in {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}

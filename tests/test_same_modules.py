@@ -121,8 +121,8 @@ def test_files_for_tools_name_the_module_that_is_loaded(name):
         assert importlib.import_module(own).__all__
 
 
-def test_modules_in_the_readme_have_files_for_tools():
-    text = (ROOT / "README.md").read_text()
+def test_modules_in_the_documentation_have_files_for_tools():
+    text = "\n".join((ROOT / page).read_text() for page in ("README.md", "docs/python.md", "docs/library.md"))
     used = set(re.findall(r"^\s*(?:from|import) (snarf\.[\w.]+)", text, re.MULTILINE))
     assert used
     assert used <= set(STATIC)

@@ -150,7 +150,7 @@ def test_the_extra_has_every_package_that_is_imported():
                 assert packages.get(top, top.replace("_", "-")) in allowed, path
 
 
-@pytest.mark.parametrize("extra", ["test", "joblib", "submitit", "view", "hub", "blender"])
+@pytest.mark.parametrize("extra", ["test", "docs", "joblib", "submitit", "view", "hub", "blender"])
 def test_other_extras_bring_the_commands(extra):
     (content,) = re.findall(rf"^{extra} = \[(.*?)\]$", (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL)
     assert '"snarf[commands]"' in content

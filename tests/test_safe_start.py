@@ -77,7 +77,7 @@ def test_preprocess(imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("snarfcli.datasets.builtin.load", lambda name, request: toy_subject(train_frames=2))
     preprocess.run(PreprocessConfig(
         subject="toy", data=DataConfig("builtin", 1, 1, 1), data_root=str(tmp_path), points_per_frame=80, padding=0.1,
-        surface_noise_m=0.01, inside_test="winding", workers=2, seed=0, overwrite=False, sequences=["fold"],
+        surface_noise_m=0.01, inside_test="winding", poisson="auto", workers=2, seed=0, overwrite=False, sequences=["fold"],
         skip_broken=False, body=None,
     ))  # fmt: skip
     assert not imported.exists()

@@ -95,7 +95,7 @@ def close_surface(points: Array, normals: Array) -> tuple[Array, NDArray[np.int6
 
 
 def _fast_length(cells: float) -> int:
-    """Return the least length of at least so many cells for which Fourier transforms are fast."""
+    """Return the smallest number of cells, at least the given one, for which Fourier transforms are fast."""
     length = fft.next_fast_len(int(np.ceil(cells)) + 1, real=True)
     assert length is not None
     return length

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface, farthest_points, vertex_normals
+from snarfcli.meshing.mesh import vertex_normals
+from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface, farthest_points
 from snarfcli.registration.scan_points import with_normals
 
 __all__ = ["AttachedPoints", "attach", "refine", "with_mean_offsets"]
@@ -93,7 +94,7 @@ def _attach_in_frame(
 ) -> tuple[Array, AttachedPoints]:
     """Return the distances [K] of the vertices to the body by place and normal, and the attached points."""
     posed = surface.posed(state)
-    normals = vertex_normals(vertices, faces)[chosen]
+    normals = vertex_normals(vertices, faces)[chosen].astype(np.float64)
     tree = KDTree(with_normals(posed.points, posed.normals))
     facing = [with_normals(vertices[chosen], sign * normals) for sign in (1.0, -1.0)]
     features = min(facing, key=lambda features: tree.query(features)[0].sum())
@@ -218,7 +219,7 @@ def with_mean_offsets(
         attached: the points.
         states: of the body in these frames.
         frames: [T, K, 3], the points in these frames, metres.
-        offset_weight: draws the offsets to 0 like so many frames in which they are 0.
+        offset_weight: number of additional frames in which the offsets are 0, which draw them to 0.
     """
     pairs = [unposed(attached.surface, state, points) for state, points in zip(states, frames, strict=True)]
     offsets = np.stack([rest for rest, _ in pairs]) - (attached.surface.points_rest - attached.offsets)

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from snarfcli.bodies import Body, Skeleton
+from snarfcli.meshing.mesh import vertex_normals
+from snarfcli.registration.kinematics import kinematics
 from snarfcli.registration.rotations import matrix_to_vector, project_to_rotations, vector_to_matrix
 
-__all__ = ["BodyState", "BodySurface", "PosedSurface", "SurfaceDerivatives", "farthest_points", "vertex_normals"]
+__all__ = ["BodyState", "BodySurface", "PosedSurface", "SurfaceDerivatives", "farthest_points"]
 
 Array = NDArray[np.float64]
 
@@ -150,7 +152,7 @@ class BodySurface:
             np.einsum("jv,vcs->jcs", regressor, shapedirs),
             template[chosen],
             shapedirs[chosen],
-            vertex_normals(template, body.faces.cpu().numpy())[chosen],
+            vertex_normals(template, body.faces.cpu().numpy())[chosen].astype(np.float64),
             weights[chosen],
             _numpy(body.posedirs)[chosen],
             chosen,
@@ -176,7 +178,7 @@ class BodySurface:
             np.zeros((len(joints), 3, 0)),
             np.asarray(vertices, np.float64)[chosen],
             np.zeros((len(chosen), 3, 0)),
-            vertex_normals(vertices, faces)[chosen],
+            vertex_normals(vertices, faces)[chosen].astype(np.float64),
             np.asarray(weights, np.float64)[chosen],
             np.zeros((len(chosen), 3, 0)),
             chosen,
@@ -251,15 +253,8 @@ class BodySurface:
 
     def _kinematics(self, state: BodyState) -> tuple[Array, Array]:
         """Return the rotations [J, 3, 3] from the rest pose, and the joints [J, 3], metres."""
-        rest = self.rest_joints(state.betas)
-        turns, joints = np.empty((self.num_joints, 3, 3)), np.empty((self.num_joints, 3))
-        for joint, parent in enumerate(self.parents):
-            if parent < 0:
-                turns[joint], joints[joint] = state.rotations[joint], rest[joint] + state.translation
-            else:
-                turns[joint] = turns[parent] @ state.rotations[joint]
-                joints[joint] = joints[parent] + turns[parent] @ (rest[joint] - rest[parent])
-        return turns, joints
+        turns, joints = kinematics(self.parents, self.rest_joints(state.betas), state.rotations[None])
+        return turns[0], joints[0] + state.translation
 
     def _posed(self, state: BodyState) -> tuple[PosedSurface, Array, Array, Array]:
         """Return the posed surface, its rest points with correctives, the blended rotations, and the joints' shifts [J, 3]."""
@@ -285,16 +280,6 @@ def farthest_points(points: Array, count: int) -> NDArray[np.intp]:
         distance = np.minimum(distance, np.square(points - points[chosen[number - 1]]).sum(1))
         chosen[number] = distance.argmax()
     return chosen
-
-
-def vertex_normals(vertices: Array, faces: NDArray) -> Array:
-    """Return the normals [V, 3] of a mesh: the mean of its faces', weighted by area; zero at vertices without faces."""
-    corners = np.asarray(vertices, np.float64)[faces]
-    of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros((len(vertices), 3))
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], of_faces)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 def _numpy(tensor: Tensor) -> Array:

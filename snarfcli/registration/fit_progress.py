@@ -14,7 +14,7 @@ class FrameProgress:
         frames: of the sequence.
         work: that is expected in all, in any unit.
         last: work of the last stage, which is known exactly; what comes before it never takes its share.
-        tell: is called with each number from 0 to `frames` - 1 once, in order; None for nobody.
+        tell: is called with each number from 0 to `frames` - 1 once, in order; None: there is no progress to report.
     """
 
     def __init__(self, frames: int, work: float, last: float, tell: Callable[[int], None] | None) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface
-from snarfcli.registration.many_poses import kinematics
+from snarfcli.registration.kinematics import kinematics
 from snarfcli.registration.rotations import nearest_rotations, project_to_rotations, vector_to_matrix
 
 __all__ = ["KnownPairs", "PairedPoses"]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface, farthest_points
-from snarfcli.registration.many_poses import kinematics
+from snarfcli.registration.kinematics import kinematics
 from snarfcli.registration.scan_grid import ScanGrid
 from snarfcli.registration.scan_points import with_normals
 from snarfcli.registration.solver import Agreement

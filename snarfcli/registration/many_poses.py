@@ -6,32 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodySurface
+from snarfcli.registration.kinematics import kinematics
 
-__all__ = ["kinematics", "posed_many"]
+__all__ = ["posed_many"]
 
 Array = NDArray[np.float64]
-
-
-def kinematics(parents: tuple[int, ...], joints_rest: Array, rotations: Array) -> tuple[Array, Array]:
-    """Return rotations from the rest pose and joints of many poses, the root in its place of the rest pose.
-
-    Args:
-        parents: J parents, -1 for the root.
-        joints_rest: [J, 3], metres.
-        rotations: [C, J, 3, 3], relative to the parents.
-
-    Returns:
-        turns: [C, J, 3, 3].
-        joints: [C, J, 3], metres.
-    """
-    turns, joints = np.empty_like(rotations), np.empty(rotations.shape[:-1])
-    for joint, parent in enumerate(parents):
-        if parent < 0:
-            turns[:, joint], joints[:, joint] = rotations[:, joint], joints_rest[joint]
-        else:
-            turns[:, joint] = turns[:, parent] @ rotations[:, joint]
-            joints[:, joint] = joints[:, parent] + turns[:, parent] @ (joints_rest[joint] - joints_rest[parent])
-    return turns, joints
 
 
 def posed_many(surface: BodySurface, rotations: Array, betas: Array) -> tuple[Array, Array]:

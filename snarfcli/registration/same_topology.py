@@ -1,7 +1,7 @@
 """Follow a body through frames that share one topology, such as registrations, simulations and exported animations.
 
-The vertices of a frame are attached to the body in a frame whose pose is known. Where they are in the other frames gives the
-poses there in closed form and a few steps (`known_pairs`), and how they move gives the shape and where the joints are
+The vertices are attached to the body in a frame whose pose is known. Their positions in the other frames determine the poses
+there, in closed form and by a few steps (`known_pairs`); their motion determines the shape and the positions of the joints
 (`attachment`). Frames of the body's own topology need no known pose.
 """
 
@@ -44,7 +44,7 @@ _STRETCHED = 2.0  # an edge that is longer or shorter by this factor does not jo
 _MOST_STRETCHED = 0.1  # share of such edges; cloth of simulations and skin near joints have 1 %
 _EXACT_M = 1e-3  # points that are so close to the body's own vertices have no offsets
 _LOST_M = 0.02  # a mean distance from the points to their places on the body from which on a frame is not trusted,
-_LOST_RATIO = 3.0  # if it also is so many times that of most frames
+_LOST_RATIO = 3.0  # if it is also this many times the residual of the frames it was prepared from
 _OBJECTIVE_M = 0.05  # as in `solver.agreement`
 OTHERS = "its vertices are others than those of the other frames"
 """Reason why a frame is not trusted."""

@@ -41,7 +41,7 @@ def fit_shape(
         surface: the body.
         frames: scans, and states near the right ones; a few may be wrong.
         prior: of the poses.
-        clothes_m: the body may be so far below the surface without cost, metres.
+        clothes_m: depth that the body may have below the surface without cost, metres.
 
     Raises:
         ValueError: there are no frames.

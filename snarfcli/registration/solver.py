@@ -95,7 +95,7 @@ class StepOptions:
     shape_is_free: bool = False
     """Change the shape parameters, too."""
     clothes_m: float = 0.0
-    """The body is inside the scan: it may be so far below the surface without cost, metres."""
+    """Depth below the surface of the scan that the body may have without cost, metres."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints, *, cloth
         surface: the body.
         state: where it is.
         scan: the points.
-        clothes_m: the body may be so far below the surface without misfit, metres.
+        clothes_m: depth that the body may have below the surface without misfit, metres.
     """
     matches = _match(surface.posed(state), scan)
     count = len(surface.points_rest)

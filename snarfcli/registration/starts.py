@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface, farthest_points
 from snarfcli.registration.joint_limits import random_poses
+from snarfcli.registration.kinematics import kinematics
 from snarfcli.registration.limbs import doubtful_limbs, find_limbs, limb_candidates
-from snarfcli.registration.many_poses import kinematics
 from snarfcli.registration.placing import StartClouds
 from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.rotations import vector_to_matrix
@@ -118,7 +118,7 @@ class PoseFinder:
         Args:
             scan: the points, in random order.
             betas: [S], shape parameters; without them the shape is free.
-            clothes_m: the body may be so far below the surface without cost, metres.
+            clothes_m: depth that the body may have below the surface without cost, metres.
             near: further starts, such as the states of frames close in time.
         """
         if betas is not None:
@@ -143,7 +143,7 @@ class PoseFinder:
         Args:
             scan: the points, in random order.
             state: to start from.
-            clothes_m: the body may be so far below the surface without cost, metres.
+            clothes_m: depth that the body may have below the surface without cost, metres.
         """
         frame = self._frame(scan, False, clothes_m)
         return frame.finished(self._with_better_limbs(frame.judged(state), frame, ScanGrid(scan)).state)

@@ -26,7 +26,7 @@ __all__ = ["Finder", "FittedSequence", "Found", "Scans", "fit_sequence"]
 Array = NDArray[np.float64]
 
 _VERTICES = 600  # that follow the body; all vertices polish it
-_KEPT_SCANS = 300  # in memory
+_KEPT_POINTS = 1_200_000  # of scans in memory: 300 scans of 4,000 points, 0.2 GB
 _SEEDS = 3  # frames that are fitted from nowhere
 _SHAPE_FRAMES = 12
 _FOLLOW_M = scales(0.08, 0.03, 10)
@@ -61,7 +61,7 @@ def fit_sequence(
         finder: of single frames.
         prior: of the pose.
         betas: [S], shape parameters; without them one shape is fitted to this sequence.
-        clothes_m: the body may be so far below the surface without cost, metres.
+        clothes_m: depth that the body may have below the surface without cost, metres.
         is_ordered: each frame is close in time to its neighbours.
         on_frame: is called with the number of each frame, in order, as the work on the whole sequence goes on.
 
@@ -118,9 +118,9 @@ class _Tracker:
 
     def scan(self, index: int) -> ScanPoints:
         if index not in self._loaded:
-            if len(self._loaded) >= _KEPT_SCANS:
-                del self._loaded[next(iter(self._loaded))]
             self._loaded[index] = self.scans[index]
+            while len(self._loaded) > 1 and sum(map(len, self._loaded.values())) > _KEPT_POINTS:
+                del self._loaded[next(iter(self._loaded))]
         return self._loaded[index]
 
     def find_seeds(self, betas: Array | None, count: int) -> None:

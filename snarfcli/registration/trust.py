@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 _SUSPICIOUS = 1.3  # times the usual misfit: such a frame is fitted again
 _UNTRUSTED = 1.7  # frames with the right pose reach 1.5
 _APART_M = 0.06  # a vertex or a point this far from its match has none,
-_POINT_SPACINGS, _VERTEX_SPACINGS = 3.0, 1.6  # if this is also so many times the spacings of both
+_POINT_SPACINGS, _VERTEX_SPACINGS = 3.0, 1.6  # if this is also that many times the spacings of both
 # Share of the vertices, and of the points, that have none. Frames with the right pose have up to 0.3 %; 1.3 % of the points in
 # clothes, 17 to 21 % beside a floor and 7 % of the vertices with missing parts, but never both. An arm has 8 % of a body.
 _MOST_APART = 0.025

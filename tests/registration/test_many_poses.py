@@ -8,7 +8,8 @@ import numpy as np
 
 from snarfcli.bodies import builtin_body
 from snarfcli.registration.body_surface import BodyState, BodySurface
-from snarfcli.registration.many_poses import kinematics, posed_many
+from snarfcli.registration.kinematics import kinematics
+from snarfcli.registration.many_poses import posed_many
 from snarfcli.registration.rotations import vector_to_matrix
 
 

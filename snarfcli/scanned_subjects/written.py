@@ -143,6 +143,8 @@ def write_fitted(folder: Path, fitted: FittedFile, made: FitMade, frame_rate: fl
     arrays = {
         "poses": fitted.poses @ world.turn,
         "trans": _file_points(fitted.translation, world),
+        "rest_up": np.array(world.up),  # for readers that do not read the skeleton beside them
+        "metres_per_unit": np.array(world.scale),
         "frame_rate": np.array(frame_rate),
         "trusted": fitted.is_trusted,
         "residual_m": fitted.residual_m,

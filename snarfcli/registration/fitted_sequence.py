@@ -61,3 +61,5 @@ class FittedSequence:
     """[T]."""
     reasons: tuple[str, ...]
     """Why a frame is not trusted; "" if it is."""
+    unseen: NDArray[np.bool_]
+    """[T, J], joints that the scan does not show; their rotations are what is usual."""

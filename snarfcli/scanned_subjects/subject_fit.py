@@ -243,6 +243,7 @@ def _whole(
         np.where(is_read, fitted.residual_m[nearest], np.nan),
         is_read & fitted.is_trusted[nearest],
         tuple(reasons),
+        fitted.unseen[nearest],
         source,
         seconds,
     )

@@ -36,7 +36,7 @@ def fitted(frames: int = 2) -> FittedFile:
     poses, places = toy_poses(frames)
     trusted = np.arange(frames) > 0
     reasons = tuple("" if one else "far away" for one in trusted)
-    return FittedFile(poses, places, np.full(frames, 0.004), trusted, reasons, "abc", 3.0)
+    return FittedFile(poses, places, np.full(frames, 0.004), trusted, reasons, poses[..., 0] > 0.5, "abc", 3.0)
 
 
 @pytest.mark.parametrize(("scale", "up"), [(1.0, "y"), (0.001, "z")])

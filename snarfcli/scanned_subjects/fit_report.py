@@ -164,7 +164,8 @@ def _remarks(content: Any) -> Iterator[Remark]:
             yield Remark("fit", text)
         if entry["not_seen"]:
             joints = one_line(", ".join(map(str, entry["not_seen"])), 300)
-            yield Remark("fit", f"{name}: joints not seen in most frames: {joints}; their poses are only what is usual", "warning")
+            text = f"{name}: joints not seen in most frames: {joints}; their poses are only what is usual"
+            yield Remark("fit", text, "warning")
     if len(content["sequences"]) > _LISTED:
         yield Remark("fit", f"and {counted(len(content['sequences']) - _LISTED, 'more sequence')}; see {REPORT}")
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 from scanned_person import BETAS, PRIOR, NearFinder, Person, surface
+from scipy.spatial import KDTree
 
 from snarfcli.registration.body_surface import BodyState
 from snarfcli.registration.scan_points import ScanPoints

@@ -22,8 +22,8 @@ _POINT_SPACINGS, _VERTEX_SPACINGS = 3.0, 1.6  # if this is also that many times 
 # clothes, 17 to 21 % beside a floor and 7 % of the vertices with missing parts, but never both. An arm has 8 % of a body.
 _MOST_APART = 0.025
 _MOST_LOST = 0.5  # share of the frames that are apart, from which on the others of the sequence cannot be trusted either
-# Share of the points that a joint should have by its share of the surface. It is 0 to 0.34 for limbs that are cut off, which the
-# body may then hide in itself, and at least 0.44 (a hand at the chest) for those that are there; with 4,000 points.
+# Share of the points that a joint should have by its share of the surface: 0 to 0.34 for limbs that are cut off, which the body
+# may then hide in itself, and at least 0.44 (a hand at the chest) for those that are there; with 4,000 points.
 _UNSEEN = 0.35
 _MEASURED = 500  # points from which the next one is searched
 _WINDOW = 61  # frames around one among which its misfit is judged

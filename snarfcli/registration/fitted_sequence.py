@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState
+from snarfcli.registration.matches import Agreement
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import Agreement
 
 __all__ = ["Finder", "FittedSequence", "Found", "Scans"]
 

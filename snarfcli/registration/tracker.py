@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from snarfcli.registration.body_surface import BodyState, BodySurface
 from snarfcli.registration.fit_progress import FrameProgress
 from snarfcli.registration.fitted_sequence import Finder, FittedSequence, Found, Scans
+from snarfcli.registration.matches import Agreement, agreement
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import different_frames, fit_shape
-from snarfcli.registration.solver import Agreement, PosePrior, agreement, fit_state, scales
+from snarfcli.registration.solver import PosePrior, fit_state, scales
 from snarfcli.registration.trust import apart_share, find_jumps, is_suspicious, judge, unseen_joints
 
 __all__ = ["Finder", "FittedSequence", "Found", "Scans", "fit_sequence"]

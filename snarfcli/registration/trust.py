@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
 from snarfcli.registration.body_surface import BodySurface
-from snarfcli.registration.solver import Agreement
+from snarfcli.registration.matches import Agreement
 
 __all__ = ["apart_share", "find_jumps", "is_suspicious", "judge", "unseen_joints", "usual_misfit"]
 

@@ -10,8 +10,8 @@ from scanned_person import BETAS, PRIOR, NearFinder, Person, surface
 from scipy.spatial import KDTree
 
 from snarfcli.registration.body_surface import BodyState
+from snarfcli.registration.matches import agreement
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import agreement
 from snarfcli.registration.tracker import FittedSequence, fit_sequence
 from snarfcli.registration.trust import unseen_joints
 

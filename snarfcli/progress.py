@@ -45,7 +45,7 @@ def progress(items: Iterable[_Item], *, total: int | None = None, desc: str, uni
             elif now - last >= _LOG_EVERY_S:
                 last = now
                 of_total = f" of {total}" if total else ""
-                log.info("%s: %d%s %s, %.1f %s/s", desc, count, of_total, unit, count / (now - start), unit)
+                log.info("%s: %d%s %s, %s", desc, count, of_total, unit, _speed(count / (now - start), unit))
 
 
 @contextlib.contextmanager
@@ -62,6 +62,10 @@ def progress_bar(*, total: int | None, done: int = 0, desc: str, unit: str) -> I
 
     with tqdm(file=_Terminal(), total=total, initial=done, desc=desc, unit=unit, dynamic_ncols=True) as bar:
         yield bar
+
+
+def _speed(per_s: float, unit: str) -> str:
+    return f"{per_s:.1f} {unit}/s" if per_s >= 1 else f"{1 / per_s:.1f} s each"
 
 
 class ProgressLines:

@@ -355,7 +355,8 @@ def _fitted(folder: Path) -> Any:
 
     made = FitMade(BETAS, FileToWorld(0.01, "z"), {"seed": 0})
     poses, places = toy_poses(2)
-    fitted = FittedFile(poses, places, np.array([0.01, np.nan]), np.array([True, False]), ("", "damaged"), "abc", 1.0)
+    residual_m, is_trusted, unseen = np.array([0.01, np.nan]), np.array([True, False]), np.zeros((2, 24), bool)
+    fitted = FittedFile(poses, places, residual_m, is_trusted, ("", "damaged"), unseen, "abc", 1.0)
     write_skeleton(folder, builtin_body().skeleton(BETAS), made)
     write_fitted(folder, fitted, made, 30.0)
     return made, fitted

@@ -10,20 +10,20 @@ import torch
 from snarfcli.bodies import builtin_body
 from snarfcli.sampling import oriented_surface_samples, winding_numbers
 
-__all__ = ["body_mesh", "sampled", "volume_iou"]
+__all__ = ["POSE", "body_mesh", "sampled", "volume_iou"]
 
 Mesh = tuple[np.ndarray, np.ndarray]
+
+POSE = torch.zeros(1, 24, 3, dtype=torch.float64)
+"""Raised arms and a bent knee, axis-angle, radians."""
+POSE[0, [5, 16, 17]] = torch.tensor([[0.9, 0.0, 0.0], [0.0, 0.0, -0.7], [0.0, 0.0, 0.5]], dtype=torch.float64)
 
 
 @functools.cache
 def body_mesh() -> Mesh:
-    """Return vertices [V, 3] and faces [F, 3] of the body with raised arms and a bent knee, metres."""
+    """Return vertices [V, 3] and faces [F, 3] of the body in `POSE`, metres."""
     body = builtin_body().to(torch.float64)
-    pose = torch.zeros(1, 24, 3, dtype=torch.float64)
-    pose[0, 5] = torch.tensor([0.9, 0.0, 0.0])
-    pose[0, 16] = torch.tensor([0.0, 0.0, -0.7])
-    pose[0, 17] = torch.tensor([0.0, 0.0, 0.5])
-    return body.pose(pose).vertices[0].numpy(), body.faces.numpy()
+    return body.pose(POSE).vertices[0].numpy(), body.faces.numpy()
 
 
 def sampled(mesh: Mesh, count: int, noise: float = 0.0) -> Mesh:

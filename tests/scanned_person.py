@@ -12,8 +12,9 @@ import trimesh
 from snarfcli.bodies import builtin_body
 from snarfcli.motions import builtin_motion
 from snarfcli.registration.body_surface import BodyState, BodySurface
+from snarfcli.registration.matches import Agreement, agreement
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import Agreement, PosePrior, agreement, fit_state, scales
+from snarfcli.registration.solver import PosePrior, fit_state, scales
 
 BETAS = np.array([1.5, -1.0, 0.5, 1.0, 0.0, -0.5, 0.0, 0.0, 0.0, 0.0])
 PRIOR = PosePrior.weak(24)

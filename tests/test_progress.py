@@ -10,8 +10,8 @@ import sys
 
 import pytest
 
-from snarfcli import progress
-from snarfcli.progress import ProgressLines
+from snarfcli import progress as progress_module
+from snarfcli.progress import ProgressLines, progress
 
 HOSTILE = "a\x1b]0;title\x07\x1b[2Jb"
 
@@ -19,7 +19,7 @@ HOSTILE = "a\x1b]0;title\x07\x1b[2Jb"
 @pytest.fixture
 def clock(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -44,6 +44,14 @@ def seen(text: str, height: int = 5) -> list[str]:
     return [line.rstrip() for line in rows]
 
 
+@pytest.mark.parametrize(("seconds", "speed"), [(0.5, "2.0 frames/s"), (4.0, "4.0 s each")])
+def test_in_a_log_slow_items_have_seconds_instead_of_a_speed_of_zero(clock, caplog, seconds, speed):
+    caplog.set_level(logging.INFO, "snarfcli")
+    for _ in progress(range(45), desc="fit", unit="frames"):
+        clock[0] += seconds
+    assert caplog.messages[0].endswith(f" of 45 frames, {speed}")
+
+
 def test_in_a_log_lines_are_one_record_per_minute(clock, caplog):
     caplog.set_level(logging.INFO, "snarfcli")
     lines = ProgressLines()
@@ -62,7 +70,7 @@ def test_on_a_terminal_lines_are_replaced(clock, monkeypatch):
     pytest.importorskip("tqdm")
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(progress.shutil, "get_terminal_size", lambda: os.terminal_size((20, 10)))
+    monkeypatch.setattr(progress_module.shutil, "get_terminal_size", lambda: os.terminal_size((20, 10)))
     lines = ProgressLines()
     assert lines.is_due()
     lines.show(["2 of 9", f" {HOSTILE}", "x" * 100])

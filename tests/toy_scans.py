@@ -11,9 +11,10 @@ import trimesh
 
 from snarfcli.bodies import builtin_body
 from snarfcli.registration.body_surface import BodyState, BodySurface
+from snarfcli.registration.matches import agreement
 from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import PosePrior, agreement, fit_state, scales
+from snarfcli.registration.solver import PosePrior, fit_state, scales
 from snarfcli.registration.starts import Found, PoseFinder
 from snarfcli.sampling import oriented_surface_samples
 from snarfcli.scanned_subjects.written import read_fitted, read_made

@@ -19,7 +19,7 @@ from omegaconf import MISSING
 import snarfcli
 from snarfcli.commands.doctor_findings import Finding, promises
 from snarfcli.commands.doctor_tools import TOOLS, describe_error, package_finding, tools
-from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.settings import DataConfig, command_settings
 from snarfcli.errors import UserError
 from snarfcli.parallel import count_cores
 from snarfcli.texts import counted
@@ -112,6 +112,7 @@ def _check_pose(config: DoctorConfig, pose: str) -> int:
     from snarfcli.commands.doctor_pose import PoseQuestion, check_pose
     from snarfcli.datasets.sources import Request
     from snarfcli.motions.layouts import HANDS
+    from snarfcli.motions.reader import motion_name
     from snarfcli.motions.up_axis import UPS
 
     check_choice("up", config.up, UPS)
@@ -119,8 +120,8 @@ def _check_pose(config: DoctorConfig, pose: str) -> int:
     data = DataConfig(name="builtin") if config.data is None and config.subject is not None else config.data
     request = None if data is None else Request(data, Path(config.data_root), config.body)
     question = PoseQuestion(pose, config.up, config.hands, config.rest, config.mapping, config.clip, request, config.subject)
-    name = Path(pose).stem
-    check_pose(question, Path(config.figure or Path(config.output_root) / "doctor" / f"{name}.png"))
+    figure = Path(config.output_root) / "doctor" / f"{motion_name(Path(pose))}.png"
+    check_pose(question, Path(config.figure or figure))
     return 0
 
 
@@ -160,12 +161,8 @@ def _check_data(config: DoctorConfig, data: DataConfig) -> int:
     if unusable:
         log.info("not usable as it is: %s (see PROBLEM above)", _listed(unusable))
     else:
-        log.info('usable; next: "snarf preprocess data=%s subject=%s%s"', data.name, chosen[0], _folder_setting(data))
+        log.info('usable; next: "snarf preprocess %s"', command_settings(data, chosen[0], config.data_root))
     return 2 if unusable else 0
-
-
-def _folder_setting(data: DataConfig) -> str:
-    return f" data.folder={data.folder}" if data.folder is not None else ""
 
 
 def _findings(examine: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:

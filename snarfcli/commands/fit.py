@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 from omegaconf import MISSING
 
 from snarfcli.checks import check_choice, check_number
-from snarfcli.datasets.settings import DataConfig
+from snarfcli.datasets.settings import DataConfig, command_settings
 from snarfcli.errors import UserError
 
 if TYPE_CHECKING:
@@ -91,8 +90,7 @@ def run(config: FitConfig) -> int:
     if not subjects:
         raise UserError(f"nothing to fit in {meshes_folder(request)}; wanted <subject>/<sequence>/ with one scan per frame")
     is_whole = [fit_subject(subject, request, options) for subject in subjects]
-    places = [f"data.folder={config.data.folder}"] if config.data.folder else []
-    settings = shlex.join(["data=meshes", f"subject={subjects[0]}", *places])
+    settings = command_settings(config.data, subjects[0], config.data_root)
     log.info('next: "snarf preprocess %s", then "snarf train %s training.refine_poses=true"', settings, settings)
     return 0 if all(is_whole) else 1
 

@@ -168,7 +168,10 @@ def _read_recording(name: str, folder: Path, skeleton: SkeletonFile, *, use_all:
         poses = replace(poses, is_trusted=None)
     if poses.is_trusted is not None and not poses.is_trusted.any():
         raise UserError(f"{path}: none of its {counted(poses.num_frames, 'frame')} is trusted; data.untrusted=true uses them")
-    return RecordedSequence(name, poses, FileMeshes(meshes, read_frame_surface, np.eye(4)))
+    files = FileMeshes(meshes, partial(read_frame_surface, parents=skeleton.parents), np.eye(4))
+    recording = RecordedSequence(name, poses, files)
+    joints = recording.joints(np.arange(len(files)), skeleton)
+    return replace(recording, meshes=replace(files, joints=joints))
 
 
 def _about_trust(recordings: list[RecordedSequence]) -> tuple[str, ...]:
@@ -206,7 +209,7 @@ def _first_mesh(recordings: list[RecordedSequence], skeleton: SkeletonFile) -> t
             frame = int(recording.usable_frames[0])
             vertices, is_cloud = read_frame_vertices(Path(recording.meshes.source(frame)))
             if len(vertices) and np.isfinite(vertices).all():
-                return vertices, recording.joints(frame, skeleton), is_cloud
+                return vertices, recording.joints(np.array([frame]), skeleton)[0], is_cloud
         except UserError as error:
             problem = problem or error
     raise problem or UserError(f"the first meshes of all {len(recordings)} sequences are empty or not finite; repair them")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -149,20 +149,23 @@ class FileMeshes:
 
     paths: Sequence[Path]
     """[T], one file per frame."""
-    read: Callable[[Path], Mesh]
-    """A module-level function that reads one file."""
+    read: Callable[..., Mesh]
+    """A module-level function that reads a file; it is given the path and, if there are any, the joints."""
     world_from_file: NDArray
     """[4, 4], transform from the units and axes of the files to metres and y up."""
+    joints: NDArray | None = None
+    """[T, J, 3], joints in each frame, units and axes of the files."""
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, index: int) -> Mesh:
-        vertices, faces = self.read(self.paths[index])
+        vertices, faces = self.read(self.paths[index], *([] if self.joints is None else [self.joints[index]]))
         return vertices @ self.world_from_file[:3, :3].T + self.world_from_file[:3, 3], faces
 
     def chosen(self, frames: NDArray[np.int64]) -> FileMeshes:
-        return FileMeshes([self.paths[frame] for frame in frames], self.read, self.world_from_file)
+        joints = None if self.joints is None else self.joints[frames]
+        return replace(self, paths=[self.paths[frame] for frame in frames], joints=joints)
 
     def source(self, index: int) -> str:
         return str(self.paths[index])

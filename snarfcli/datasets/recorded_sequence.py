@@ -25,6 +25,7 @@ PERSON_M = 1.8
 
 _SCALE_LIMITS = (1e-6, 1e6)  # metres per unit, from micrometres to 1000 km
 _NEAR_A_PERSON_M = (1.2, 2.4)
+_FRAMES_AT_ONCE = 4096
 _TOLERANCE_M = 1e-3  # poses that reproduce the bone transforms within a millimetre replace them
 
 
@@ -91,10 +92,14 @@ class RecordedSequence:
         poses, translation = (torch.from_numpy(array[frames]) for array in (self.poses.poses, self.poses.translation))
         return forward_kinematics(poses, torch.from_numpy(skeleton.joints_rest), skeleton.parents, translation)[1].numpy()
 
-    def joints(self, frame: int, skeleton: SkeletonFile) -> NDArray[np.float64]:
-        """Return the joints [J, 3] in a frame, units of the file."""
-        moved = self.bone_transforms(np.array([frame]), skeleton)[0]
-        return np.einsum("jab,jb->ja", moved[:, :3, :3], skeleton.joints_rest) + moved[:, :3, 3]
+    def joints(self, frames: NDArray[np.int64], skeleton: SkeletonFile) -> NDArray[np.float64]:
+        """Return the joints [K, J, 3] in the frames with these indices [K], units of the file."""
+        joints = np.empty((len(frames), *skeleton.joints_rest.shape))
+        for first in range(0, len(frames), _FRAMES_AT_ONCE):
+            part = slice(first, first + _FRAMES_AT_ONCE)
+            moved = self.bone_transforms(frames[part], skeleton)
+            joints[part] = np.einsum("kjab,jb->kja", moved[..., :3, :3], skeleton.joints_rest) + moved[..., :3, 3]
+        return joints
 
     def to_sequence(self, split: Split, skeleton: Skeleton, world: FileToWorld) -> SequenceSpec:
         """Return the converted sequence; bone transforms are kept only if the poses do not reproduce them."""
@@ -128,7 +133,7 @@ class RecordedSequence:
         arrays = {key: getattr(self.poses, key) for key in ("poses", "translation", "posed_from_rest", "is_trusted")}
         poses = replace(self.poses, **{key: array[frames] for key, array in arrays.items() if array is not None})
         if isinstance(self.meshes, FileMeshes):
-            return RecordedSequence(name, poses, replace(self.meshes, paths=self.meshes.paths[frames]))
+            return RecordedSequence(name, poses, self.meshes.chosen(np.arange(len(self.meshes))[frames]))
         return RecordedSequence(name, poses, replace(self.meshes, posed_from_rest=self.meshes.posed_from_rest[frames]))
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, field
 
 from omegaconf import MISSING
 
-__all__ = ["DataConfig"]
+__all__ = ["DataConfig", "command_settings"]
+
+_USUAL_ROOT = "data"  # in conf/
 
 
 @dataclass
@@ -39,3 +42,11 @@ class DataConfig:
     """Use also frames whose pose file says that their poses are not to be trusted (snarf fit), for meshes."""
     canonical: str = "auto"
     """Canonical pose, for meshes: rest; legs_apart (SNARF's, if rest is a T-pose); auto (from the skeleton file, else rest)."""
+
+
+def command_settings(data: DataConfig, subject: str, data_root: str) -> str:
+    """Return the settings that name a subject on a command line, for messages that say what to do next."""
+    words = [f"data={data.name}", f"subject={subject}"]
+    words += [f"data.folder={data.folder}"] if data.folder else []
+    words += [f"data_root={data_root}"] if data_root != _USUAL_ROOT else []
+    return shlex.join(words)

@@ -18,7 +18,7 @@ from snarfcli.motions.motion import Motion
 from snarfcli.motions.pose_parts import numbers, poses_of
 from snarfcli.motions.pose_sets import PoseSet
 from snarfcli.motions.positions import are_positions
-from snarfcli.motions.up_axis import UPS, Up, hangs_head_down, up_axis, upright
+from snarfcli.motions.up_axis import UPS, Up, hangs_head_down, up_axis, upright, y_from_up
 
 __all__ = ["DEFAULT_FRAME_RATE", "VIDEO_FRAME_RATE", "frame_rate_of", "motion_from_arrays", "place_of"]
 
@@ -40,7 +40,7 @@ def motion_from_arrays(arrays: PoseSet, skeleton: Skeleton, path: Path, *, name:
 
     Args:
         arrays: poses as [T, 3 K], [T, K, 3] or rotation matrices [T, K, 3, 3], or root, body and further parts. Optional: a
-            translation; a divisor of it; a frame rate; the up axis as text.
+            translation; a divisor of it, or metres per unit; a frame rate; the up axis as text; the up axis of the rest pose.
         skeleton: skeleton of the poses to return.
         path: the file, for messages.
         name: name of the motion.
@@ -62,6 +62,10 @@ def motion_from_arrays(arrays: PoseSet, skeleton: Skeleton, path: Path, *, name:
     has_place = translation is not None
     translation = np.zeros((frames, 3)) if translation is None else translation
     root_rest = skeleton.joints_rest[0].detach().cpu().double().numpy()
+    if up == "auto" and "rest_up" in arrays.found:
+        turn = y_from_up(_declared_up(arrays, "rest_up"))  # of all that has axes: the rest pose is then that of the skeleton
+        poses = turn.apply(poses.reshape(-1, 3)).reshape(poses.shape)
+        return Motion(name, poses, turn.apply(translation), frame_rate_of(arrays, path))
     if "placed_rotation" in arrays.found and "placed_translation" in arrays.found:
         poses, translation = _placed(poses, arrays, root_rest, path)
         has_place = True
@@ -86,7 +90,7 @@ def place_of(arrays: PoseSet, frames: int, path: Path) -> Array | None:
     if translation.shape != (frames, 3):
         shape = list(translation.shape)
         raise UserError(f"pose file {path}: {key}: wanted shape [{frames}, 3], got {shape}; repair the file")
-    translation = translation / _scaling(arrays, path)
+    translation = translation * _metres_per_unit(arrays, path)
     if np.abs(translation).max() > _MAX_DISTANCE_M:
         limit = f"at most {_MAX_DISTANCE_M / 1000:g} km"
         raise UserError(f"pose file {path}: {key}: wanted metres, {limit}, got more; repair the file")
@@ -105,7 +109,7 @@ def frame_rate_of(arrays: PoseSet, path: Path) -> float:
 
 def _guessed_up(arrays: PoseSet, poses: Array, skeleton: Skeleton, has_place: bool, path: Path) -> Up:
     """Return the up axis that the file declares, that of its kind of file, or that along which the body stands."""
-    up = _declared_up(arrays)
+    up = _declared_up(arrays, "up")
     if up == "auto" and layout_of(skeleton) is not None and _is_amass(arrays):
         up = "z"
     elif up == "auto" and _has_y_up(arrays):
@@ -120,9 +124,9 @@ def _guessed_up(arrays: PoseSet, poses: Array, skeleton: Skeleton, has_place: bo
     return up
 
 
-def _declared_up(arrays: PoseSet) -> Up:
-    """Return the up axis that the file declares; `auto` if it does not."""
-    value = arrays.found.get("up", ("", ""))[1]
+def _declared_up(arrays: PoseSet, role: str) -> Up:
+    """Return the up axis that the file declares in an array of this role; `auto` if it does not."""
+    value = arrays.found.get(role, ("", ""))[1]
     word = str(value.ravel()[0] if isinstance(value, np.ndarray) and value.size else value)
     return cast(Up, word) if word in UPS else "auto"
 
@@ -201,6 +205,10 @@ def _positive(array: object, key: str, path: Path) -> float:
     return float(values.item())
 
 
-def _scaling(arrays: PoseSet, path: Path) -> float:
-    """Return the divisor of AIST++'s translation; 1 for other files."""
-    return _positive(arrays.found["scaling"][1], arrays.found["scaling"][0], path) if "scaling" in arrays.found else 1.0
+def _metres_per_unit(arrays: PoseSet, path: Path) -> float:
+    """Return the factor of the translation: as declared, 1 / scaling for AIST++, 1 for other files."""
+    for role, power in (("metres_per_unit", 1), ("scaling", -1)):
+        if role in arrays.found:
+            key, value = arrays.found[role]
+            return _positive(value, key, path) ** power
+    return 1.0

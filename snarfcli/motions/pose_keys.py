@@ -21,6 +21,9 @@ _ROLES = {
     "frame_rate": FRAME_RATES,
     "scaling": ("smpl_scaling",),
     "up": ("up",),
+    # of `snarf fit`: poses of a skeleton that rests in the axes and the unit of its own files
+    "rest_up": ("rest_up",),
+    "metres_per_unit": ("metres_per_unit",),
     "root": ("root_orient", "global_orient", "poses_root"),
     "body": ("pose_body", "body_pose", "poses_body"),
     "hands": ("pose_hand", "hand_pose"),

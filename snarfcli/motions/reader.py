@@ -24,12 +24,21 @@ from snarfcli.motions.retarget import Retargeted, choose_clip, retarget_rig
 from snarfcli.motions.rig_rest import check_rest
 from snarfcli.motions.up_axis import UPS, Up
 
-__all__ = ["MOTION_SUFFIXES", "RIG_SUFFIXES", "average_skeleton", "read_motion", "read_motion_and_source", "read_rig"]
+__all__ = [
+    "MOTION_SUFFIXES",
+    "RIG_SUFFIXES",
+    "average_skeleton",
+    "motion_name",
+    "read_motion",
+    "read_motion_and_source",
+    "read_rig",
+]
 
 RIG_SUFFIXES = (".bvh", *GLTF_SUFFIXES)
 """Suffixes of files with joints of their own, in lower case."""
 MOTION_SUFFIXES = (*POSE_SUFFIXES, *RIG_SUFFIXES)
 """Suffixes of supported files, in lower case."""
+_SAME_NAMES = ("poses", "motion")  # of the pose files of `data=meshes`: the folder has the name of the sequence
 _RIGS = f"a file ending in {', '.join(RIG_SUFFIXES)}"
 
 
@@ -62,8 +71,9 @@ def read_motion(
             SMPL-X joint by joint: hands and face are kept if both have them, else zero. For another kind of skeleton, an array
             has 3 values per joint. Poses of rigs are retargeted by bone directions and the height of the hips.
         up: up axis of the file: y, z, x, or their opposites, such as -y for the frame of a camera. `auto`: for arrays, the text
-            `up` if present; else z for AMASS, y for AIST++ and GVHMR, y for other arrays without a translation. Otherwise, and
-            for rigs, the axis y or z along which the body stands. -y if a body hangs head down along y during the whole clip.
+            `up` if present, and the axes in which the skeleton rests for poses of `snarf fit`; else z for AMASS, y for AIST++
+            and GVHMR, y for other arrays without a translation. Otherwise, and for rigs, the axis y or z along which the body
+            stands. -y if a body hangs head down along y during the whole clip.
             A glTF file of the skeleton itself has y up, as the format requires.
         hands: pose of SMPL's two hand joints if an array has fingers instead: `rest`, zero; or `released`, values 66 to 72, as
             in the training data of the released code.
@@ -77,7 +87,7 @@ def read_motion(
             first clip, or the first person in the world.
 
     Returns:
-        The motion in a world with y up, facing as in the file, named after the file.
+        The motion in a world with y up, facing as in the file, named after the file, or after the folder of a `poses.npz`.
 
     Raises:
         UserError: the file is missing, of another kind, damaged, or does not fit the skeleton; the message says why.
@@ -109,7 +119,7 @@ def read_motion_and_source(
     if suffix in RIG_SUFFIXES and not path.is_dir():
         rig = read_rig(path)
         chosen = choose_clip(rig, clip, path)
-        name = path.stem if len(rig.clips) == 1 else f"{path.stem}_{chosen.name}"
+        name = motion_name(path) if len(rig.clips) == 1 else f"{motion_name(path)}_{chosen.name}"
         found = retarget_rig(rig, chosen, skeleton, path=path, name=name, up=up, rest=rest, mapping=mapping)
         return found.motion, found
     if not path.exists():
@@ -121,7 +131,7 @@ def read_motion_and_source(
     if clip is not None and len(sets) == 1:
         raise UserError(f"clip: wanted {_RIGS}, got pose file {path} with one motion; leave it out")
     arrays = choose_set(sets, clip, path)
-    name = path.name if path.is_dir() else path.stem
+    name = motion_name(path)
     if len(sets) > 1:
         name = f"{name}_{re.sub(r'[^0-9A-Za-z.-]+', '_', arrays.label)}"
     if not arrays.has_poses:
@@ -131,6 +141,13 @@ def read_motion_and_source(
         if is_given:
             raise UserError(f"{setting}: wanted {_RIGS}, got pose file {path}; leave it out")
     return motion_from_arrays(arrays, skeleton, path, name=name, up=up, hands=hands), None
+
+
+def motion_name(path: Path) -> str:
+    """Return the name of the motion in a file or folder: for a `poses.npz` or `motion.bvh`, that of the folder around it."""
+    if path.is_dir():
+        return path.name
+    return path.absolute().parent.name or path.stem if path.stem in _SAME_NAMES else path.stem
 
 
 def average_skeleton() -> Skeleton:

@@ -1,6 +1,7 @@
 """Points on the surface of something: their files, their normals, and the closed surface around them."""
 
 import snarfcli.extras.commands  # noqa: F401 - raises MissingPackage
+from snarfcli.point_clouds.bone_sides import bone_normals
 from snarfcli.point_clouds.closing import close_surface
 from snarfcli.point_clouds.files import PointFile, list_frames, read_frame, read_points
 from snarfcli.point_clouds.normals import CheckedNormals, check_normals, estimate_normals
@@ -8,6 +9,7 @@ from snarfcli.point_clouds.normals import CheckedNormals, check_normals, estimat
 __all__ = [
     "CheckedNormals",
     "PointFile",
+    "bone_normals",
     "check_normals",
     "close_surface",
     "estimate_normals",

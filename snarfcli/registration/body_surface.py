@@ -194,6 +194,11 @@ class BodySurface:
         return follows
 
     @cached_property
+    def bones(self) -> NDArray[np.intp]:
+        """[K], the joint that moves each point most."""
+        return self.weights.argmax(1)
+
+    @cached_property
     def shares(self) -> Array:
         """[K, J], share of each point that follows a joint."""
         return self.weights @ self.follows

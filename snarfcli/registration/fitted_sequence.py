@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState
+from snarfcli.registration.matches import Agreement
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import Agreement
 
 __all__ = ["Finder", "FittedSequence", "Found", "Scans"]
 
@@ -61,3 +61,5 @@ class FittedSequence:
     """[T]."""
     reasons: tuple[str, ...]
     """Why a frame is not trusted; "" if it is."""
+    unseen: NDArray[np.bool_]
+    """[T, J], joints that the scan does not show; their rotations are what is usual."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface, farthest_points
 from snarfcli.registration.kinematics import kinematics
+from snarfcli.registration.matches import Agreement
 from snarfcli.registration.scan_grid import ScanGrid
 from snarfcli.registration.scan_points import with_normals
-from snarfcli.registration.solver import Agreement
 
 __all__ = ["Limb", "doubtful_limbs", "find_limbs", "limb_candidates", "squared_distances"]
 

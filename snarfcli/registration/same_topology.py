@@ -152,7 +152,14 @@ class TopologyFollower:
             tell(frame)
         is_trusted = np.array([not reason for reason in reasons])
         return FittedSequence(
-            matrix_to_vector(rotations), translation, self.betas, residual, objective, is_trusted, tuple(reasons)
+            matrix_to_vector(rotations),
+            translation,
+            self.betas,
+            residual,
+            objective,
+            is_trusted,
+            tuple(reasons),
+            np.zeros(rotations.shape[:2], bool),
         )
 
 

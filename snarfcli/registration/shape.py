@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snarfcli.registration.body_surface import BodyState, BodySurface, farthest_points
+from snarfcli.registration.matches import agreement
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import SHAPE_PRIOR, PosePrior, StepOptions, agreement, equations, moved, scales
+from snarfcli.registration.solver import SHAPE_PRIOR, PosePrior, StepOptions, equations, moved, scales
 
 __all__ = ["FittedShape", "different_frames", "fit_shape"]
 

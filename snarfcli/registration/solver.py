@@ -14,17 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface
-from snarfcli.registration.scan_points import ScanPoints, with_normals
+from snarfcli.registration.matches import ALL_DIRECTIONS, Matches, match, outside_clothes
+from snarfcli.registration.scan_points import ScanPoints
 
 __all__ = [
     "SHAPE_PRIOR",
-    "Agreement",
     "PosePrior",
     "StepOptions",
-    "agreement",
     "equations",
     "fit_state",
     "moved",
@@ -34,12 +32,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-_LEAST_AGREEMENT = 0.2  # cosine between the normals of a match; with less, a match counts little
 _DISAGREEING_WEIGHT = 0.02
-_ALL_DIRECTIONS = 0.1  # weight of the distance in all directions, relative to that along the normal
-_SCAN_POINTS = 1000  # of a scan that are matched with vertices; the vertices are matched with all points
-_BEYOND_M, _BORDER_M = 0.03, 0.02  # a vertex further than this from the scan, and this near to its border, is not seen
-_UNSEEN_M = 0.03  # distance that a vertex which is not seen counts as, so that hiding a limb is no gain
 _LEAST_WEIGHT = 1e-12  # keeps the weights of a vertex positive definite
 SHAPE_PRIOR = 1e-6  # per squared unit of a shape parameter; the weights of the matches of each side sum to 1, metres squared
 _WEAK_WEIGHT = 2e-6  # of a pose, squared metres per squared radian
@@ -51,8 +44,6 @@ _DAMPING = 1e-6  # relative to the mean of the diagonal
 _LONGEST_TURN_RAD = 0.35  # in one step
 _LONGEST_SHIFT_M = 0.2
 _LONGEST_BETA = 1.0
-_RESIDUAL_CAP_M = 0.1  # a longer distance counts as this one in the residual
-_OBJECTIVE_M = 0.05  # scale of the objective
 _ROW, _COLUMN = np.triu_indices(3)  # the six different entries of a symmetric matrix
 _IS_DIAGONAL = _ROW == _COLUMN
 _ENTRY = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -96,37 +87,6 @@ class StepOptions:
     """Change the shape parameters, too."""
     clothes_m: float = 0.0
     """Depth below the surface of the scan that the body may have without cost, metres."""
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """How well a body and a scan agree."""
-
-    objective: float
-    """Mean robust distance of both sides, from 0 (perfect) to 2 (nothing matches)."""
-    misfit: float
-    """The same of what a step makes small: distances along the surface count a tenth, those inside the clothes nothing. Unlike
-    the objective it hardly has a share that comes from the spacing of the vertices, so it tells lost limbs better."""
-    residual_m: float
-    """Mean distance of both sides, metres: along the normal of the scan where the normals agree, so that the spacing of the
-    points hardly counts. Distances above 10 cm count as 10 cm; vertices beyond the border of the scan do not count."""
-    of_body: Array
-    """[K], distance from each vertex to its match, metres; of those beyond the border of the scan, at most 3 cm."""
-    of_scan: Array
-    """[M], distance from each of the first M points of the scan to its match, metres."""
-    partners: NDArray[np.intp]
-    """[M], numbers of these matches among the body's vertices."""
-
-
-@dataclass(frozen=True)
-class _Matches:
-    body: NDArray[np.intp]  # [K + M] numbers of vertices; K matches of vertices, then M of points
-    points: Array  # [K + M, 3]
-    normals: Array  # [K + M, 3]
-    agree: NDArray[np.bool_]  # [K + M]
-    offset: Array  # [K + M, 3] from the point of the scan to the vertex, metres
-    share: Array  # [K + M] 1 / K or 1 / M
-    unseen: NDArray[np.bool_]  # [K + M] vertices whose place the scan does not show
 
 
 def scales(first_m: float, last_m: float, steps: int) -> Array:
@@ -183,7 +143,7 @@ def equations(
     posed, derivatives = surface.posed_with_derivatives(state)
     if not options.shape_is_free:
         derivatives = replace(derivatives, by_beta=derivatives.by_beta[:, :, :0])
-    weights, pulls = _by_vertex(_match(posed, scan), len(posed.points), options)
+    weights, pulls = _by_vertex(match(posed, scan), len(posed.points), options)
     system, gradient = derivatives.normal_equations(weights, pulls)
     _add_prior(system, gradient, surface, state, posed, prior)
     system[np.diag_indices(len(system))] += _DAMPING * np.trace(system) / len(system)
@@ -208,75 +168,15 @@ def moved(surface: BodySurface, state: BodyState, posed: PosedSurface, change: A
     return BodyState(surface.turned(state, posed, turned), translation, betas)
 
 
-def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints, *, clothes_m: float = 0.0) -> Agreement:
-    """Measure how well a body agrees with a scan.
-
-    Args:
-        surface: the body.
-        state: where it is.
-        scan: the points.
-        clothes_m: depth that the body may have below the surface without misfit, metres.
-    """
-    matches = _match(surface.posed(state), scan)
-    count = len(surface.points_rest)
-    squared = np.square(matches.offset).sum(1)
-    height, offset = _outside_clothes(matches, clothes_m)
-    apart = np.square(offset).sum(1)
-    apart = np.where(matches.agree, np.square(height) + _ALL_DIRECTIONS * apart, apart)
-    apart, squared = (np.where(matches.unseen, np.minimum(_UNSEEN_M**2, each), each) for each in (apart, squared))
-    distance = np.sqrt(squared)
-    return Agreement(
-        objective=float((matches.share * squared / (squared + _OBJECTIVE_M**2)).sum()),
-        misfit=float((matches.share * apart / (apart + _OBJECTIVE_M**2)).sum()),
-        residual_m=_residual_m(matches),
-        of_body=distance[:count],
-        of_scan=distance[count:],
-        partners=matches.body[count:],
-    )
-
-
-def _residual_m(matches: _Matches) -> float:
-    """Return the residual of an agreement."""
-    distance = np.linalg.norm(matches.offset, axis=1)
-    along = np.where(matches.agree, np.abs((matches.offset * matches.normals).sum(1)), distance)
-    counts = np.where(matches.unseen, 0.0, matches.share)
-    far = distance > _RESIDUAL_CAP_M  # a height says nothing about a match that is far to the side
-    return float((counts * np.where(far, _RESIDUAL_CAP_M, along)).sum() / counts.sum())
-
-
-def _match(posed: PosedSurface, scan: ScanPoints) -> _Matches:
-    """Match every vertex with a point, and some points with a vertex."""
-    features = with_normals(posed.points, posed.normals)
-    _, partner = scan.tree.query(features)
-    count = min(_SCAN_POINTS, len(scan))  # the points of a scan are in random order
-    _, back = KDTree(features).query(scan.features[:count])
-    body = np.concatenate([np.arange(len(features)), back])
-    chosen = np.concatenate([partner, np.arange(count)])
-    points, normals = scan.points[chosen], scan.normals[chosen]
-    agree = (posed.normals[body] * normals).sum(1) > _LEAST_AGREEMENT
-    share = np.concatenate([np.full(len(features), 1 / len(features)), np.full(count, 1 / count)])
-    offset = posed.points[body] - points
-    return _Matches(body, points, normals, agree, offset, share, _unseen(posed, scan, offset))
-
-
-def _unseen(posed: PosedSurface, scan: ScanPoints, offset: Array) -> NDArray[np.bool_]:
-    """Return which matches are of vertices beyond the border of the scan: away from their points, and no closer to others."""
-    unseen = np.zeros(len(offset), bool)
-    if scan.border is not None:
-        apart = np.linalg.norm(offset[: len(posed.points)], axis=1)
-        unseen[: len(apart)] = (apart > _BEYOND_M) & (scan.border.query(posed.points)[0] < apart + _BORDER_M)
-    return unseen
-
-
-def _by_vertex(matches: _Matches, count: int, options: StepOptions) -> tuple[Array, Array]:
+def _by_vertex(matches: Matches, count: int, options: StepOptions) -> tuple[Array, Array]:
     """Return the weights [K, 3, 3] and pulls [K, 3] of the vertices, summed over their matches."""
-    height, offset = _outside_clothes(matches, options.clothes_m)
+    height, offset = outside_clothes(matches, options.clothes_m)
     weight = matches.share / np.square(1 + np.square(offset).sum(1) / options.scale_m**2)
     weight = np.where(matches.agree, weight, _DISAGREEING_WEIGHT * weight)
     weight[matches.unseen] = 0.0
-    pulls = weight[:, None] * (height[:, None] * matches.normals + _ALL_DIRECTIONS * offset)
+    pulls = weight[:, None] * (height[:, None] * matches.normals + ALL_DIRECTIONS * offset)
     outer = weight[:, None] * matches.normals[:, _ROW] * matches.normals[:, _COLUMN]
-    outer[:, _IS_DIAGONAL] += (_ALL_DIRECTIONS * weight)[:, None]
+    outer[:, _IS_DIAGONAL] += (ALL_DIRECTIONS * weight)[:, None]
     values = np.concatenate([outer, pulls], 1)
     sums = values[:count]  # the first K matches are those of the K vertices, in order
     for column in range(values.shape[1]):
@@ -284,13 +184,6 @@ def _by_vertex(matches: _Matches, count: int, options: StepOptions) -> tuple[Arr
     weights = sums[:, _ENTRY]
     weights[:, np.arange(3), np.arange(3)] += _LEAST_WEIGHT
     return weights, sums[:, 6:]
-
-
-def _outside_clothes(matches: _Matches, clothes_m: float) -> tuple[Array, Array]:
-    """Return the heights [N] above the scan and the offsets [N, 3] from it, metres; depths up to `clothes_m` count as none."""
-    height = (matches.offset * matches.normals).sum(1)
-    free = np.clip(height, -clothes_m, 0.0)
-    return height - free, matches.offset - free[:, None] * matches.normals
 
 
 def _add_prior(

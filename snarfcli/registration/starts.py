@@ -12,12 +12,13 @@ from snarfcli.registration.body_surface import BodyState, BodySurface, farthest_
 from snarfcli.registration.joint_limits import random_poses
 from snarfcli.registration.kinematics import kinematics
 from snarfcli.registration.limbs import doubtful_limbs, find_limbs, limb_candidates
+from snarfcli.registration.matches import Agreement, agreement
 from snarfcli.registration.placing import StartClouds
 from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.rotations import vector_to_matrix
 from snarfcli.registration.scan_grid import ScanGrid
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import Agreement, PosePrior, agreement, fit_state, scales
+from snarfcli.registration.solver import PosePrior, fit_state, scales
 
 __all__ = ["Found", "PoseFinder"]
 

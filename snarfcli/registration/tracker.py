@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from snarfcli.registration.body_surface import BodyState, BodySurface
 from snarfcli.registration.fit_progress import FrameProgress
 from snarfcli.registration.fitted_sequence import Finder, FittedSequence, Found, Scans
+from snarfcli.registration.matches import Agreement, agreement
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import different_frames, fit_shape
-from snarfcli.registration.solver import Agreement, PosePrior, agreement, fit_state, scales
-from snarfcli.registration.trust import apart_share, find_jumps, is_suspicious, judge
+from snarfcli.registration.solver import PosePrior, fit_state, scales
+from snarfcli.registration.trust import apart_share, find_jumps, is_suspicious, judge, unseen_joints
 
 __all__ = ["Finder", "FittedSequence", "Found", "Scans", "fit_sequence"]
 
@@ -238,6 +239,7 @@ class _Tracker:
             np.array([one.objective for one in agreements]),
             np.array([not reason for reason in reasons]),
             reasons,
+            np.stack([unseen_joints(one.partners, self.surface) for one in agreements]),
         )
 
     def _next(self, index: int, before: BodyState | None, last: BodyState) -> tuple[BodyState, float]:

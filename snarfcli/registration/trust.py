@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
-from snarfcli.registration.solver import Agreement
+from snarfcli.registration.body_surface import BodySurface
+from snarfcli.registration.matches import Agreement
 
-__all__ = ["apart_share", "find_jumps", "is_suspicious", "judge", "usual_misfit"]
+__all__ = ["apart_share", "find_jumps", "is_suspicious", "judge", "unseen_joints", "usual_misfit"]
 
 Array = NDArray[np.float64]
 
@@ -21,6 +22,9 @@ _POINT_SPACINGS, _VERTEX_SPACINGS = 3.0, 1.6  # if this is also that many times 
 # clothes, 17 to 21 % beside a floor and 7 % of the vertices with missing parts, but never both. An arm has 8 % of a body.
 _MOST_APART = 0.025
 _MOST_LOST = 0.5  # share of the frames that are apart, from which on the others of the sequence cannot be trusted either
+# Share of the points that a joint should have by its share of the surface: 0 to 0.34 for limbs that are cut off, which the body
+# may then hide in itself, and at least 0.44 (a hand at the chest) for those that are there; with 4,000 points.
+_UNSEEN = 0.35
 _MEASURED = 500  # points from which the next one is searched
 _WINDOW = 61  # frames around one among which its misfit is judged
 _JUMP_M = 0.15  # of a joint, between a frame and the middle of its neighbours
@@ -51,6 +55,18 @@ def apart_share(found: Agreement, vertices: Array, points: Array, clothes_m: flo
     """
     far = max(_APART_M, _POINT_SPACINGS * _spacing_m(points), _VERTEX_SPACINGS * _spacing_m(vertices)) + clothes_m
     return float(min((found.of_body > far).mean(), (found.of_scan > far).mean()))
+
+
+def unseen_joints(partners: NDArray[np.intp], surface: BodySurface) -> NDArray[np.bool_]:
+    """Return the joints [J] that the scan does not show: they and those that follow them have far less points than they should.
+
+    Args:
+        partners: [M], number of the closest vertex of each point, as in `Agreement`.
+        surface: the body, K vertices spread evenly.
+    """
+    vertices = np.bincount(surface.bones, minlength=surface.num_joints) @ surface.follows / len(surface.bones)
+    points = np.bincount(surface.bones[partners], minlength=surface.num_joints) @ surface.follows / len(partners)
+    return points < _UNSEEN * vertices
 
 
 def _spacing_m(points: Array) -> float:

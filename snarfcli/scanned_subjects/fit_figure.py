@@ -24,7 +24,7 @@ __all__ = ["write_fit_figure"]
 
 _ROWS = 3
 _PANEL = 320  # pixels
-_STRETCHES = 8  # parts of a sequence; at most one frame of each is among the worst, and one among the best
+_WORST_PARTS = 8  # of a sequence; at most one frame of each is among the worst
 _DRAWN_POINTS = 20_000
 _DISC_M = (0.004, 0.02)  # radius of a point
 _DISC = 0.75  # the same, times the distance between neighbours: most gaps close, and fingers stay apart
@@ -68,16 +68,17 @@ def _extremes(reports: Sequence[SequenceReport]) -> tuple[list[tuple[SequenceRep
     frames.sort(key=lambda one: (one[0], one[1].number, one[2]))
     count = min(_ROWS, max(1, len(frames) // 2))
 
-    def pick(candidates: Sequence[tuple[float, SequenceReport, int]]) -> list[tuple[SequenceReport, int]]:
+    def pick(candidates: Sequence[tuple[float, SequenceReport, int]], parts: int) -> list[tuple[SequenceReport, int]]:
         chosen: dict[tuple[int, int], tuple[SequenceReport, int]] = {}
         for _, report, frame in candidates:
-            stretch = (report.number, frame * _STRETCHES // len(report.fitted.poses))
-            chosen.setdefault(stretch, (report, frame))
+            part = (report.number, frame * parts // len(report.fitted.poses))
+            chosen.setdefault(part, (report, frame))
         return list(chosen.values())[:count]
 
-    worst = pick(frames[::-1])
+    worst = pick(frames[::-1], _WORST_PARTS)
     taken = {(report.number, frame) for report, frame in worst}
-    return worst, pick([one for one in frames if (one[1].number, one[2]) not in taken])
+    others = [one for one in frames if (one[1].number, one[2]) not in taken]
+    return worst, pick(others, -(-count // len(reports)))  # frames that fit well are often alike: few parts, far apart
 
 
 def _draw(

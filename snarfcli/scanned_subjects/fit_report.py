@@ -29,6 +29,7 @@ FIGURE = "fit.png"
 REPORT = "fit.json"
 """Name of the report, in the folder of the subject."""
 _UNTRUSTED_SHARE = 0.1  # of the frames of a sequence, above which something should be done
+_MOSTLY = 0.5  # of the frames
 _LISTED = 8
 
 
@@ -50,6 +51,11 @@ class SequenceReport:
         """Number of frames that are not trusted."""
         return int((~self.fitted.is_trusted).sum())
 
+    @property
+    def unseen_joints(self) -> list[str]:
+        """Names of the joints that are not seen in most frames; their rotations are only what is usual."""
+        return [self.joint_names[joint] for joint in np.flatnonzero(self.fitted.unseen.mean(0) > _MOSTLY)]
+
     def residual_mm(self) -> tuple[float, float]:
         """Return the mean residual of the frames that can be read and the one that 95 % of them do not exceed, millimetres."""
         known = self.fitted.residual_m[np.isfinite(self.fitted.residual_m)]
@@ -62,9 +68,10 @@ class SequenceReport:
         trusted = "all trusted"
         if self.untrusted:
             trusted = f"{self.untrusted} not trusted, such as frame {first} ({self.fitted.reasons[first]})"
+        unseen = f"; joints not seen in most frames: {', '.join(self.unseen_joints)}" if self.unseen_joints else ""
         return (
             f"{self.name}: {counted(len(self.fitted.poses), 'frame')}, {mean:.1f} mm from the points on average, 95 % under "
-            f"{most:.1f} mm; {trusted}; {self.fitted.seconds:.0f} s of one core"
+            f"{most:.1f} mm; {trusted}{unseen}; {self.fitted.seconds:.0f} s of one core"
         )
 
     @cached_property
@@ -84,6 +91,7 @@ class SequenceReport:
             "residual_mm_95": round(most, 2),
             "core_seconds": round(fitted.seconds, 1),
             "not_trusted_frames": [{"reason": reason, "frames": _runs(frames)} for reason, frames in reasons.items()],
+            "not_seen": self.unseen_joints,
             "near_limits": {joint: _runs(frames) for joint, frames in sorted(limits.items())},
             "residual_mm_per_frame": [
                 round(1000 * residual, 2) if math.isfinite(residual) else None for residual in fitted.residual_m.tolist()
@@ -154,6 +162,10 @@ def _remarks(content: Any) -> Iterator[Remark]:
             yield Remark("fit", text, "warning")
         else:
             yield Remark("fit", text)
+        if entry["not_seen"]:
+            joints = one_line(", ".join(map(str, entry["not_seen"])), 300)
+            text = f"{name}: joints not seen in most frames: {joints}; their poses are only what is usual"
+            yield Remark("fit", text, "warning")
     if len(content["sequences"]) > _LISTED:
         yield Remark("fit", f"and {counted(len(content['sequences']) - _LISTED, 'more sequence')}; see {REPORT}")
 

@@ -124,6 +124,8 @@ def _check_others(place: Path, folders: Sequence[ScanFolder], options: FitOption
 def _require_same(place: Path, made: FitMade, settings: dict[str, Any]) -> None:
     """Raise UserError if an earlier fit has other settings."""
     names = [name for name in settings if settings[name] != made.settings.get(name)]
+    if "body_digest" not in names:
+        names = [name for name in names if name not in ("body", "skeleton")]  # the same file in another place
     if names:
         changes = ", ".join(f"{name} {made.settings.get(name)} -> {settings[name]}" for name in names)
         raise UserError(
@@ -243,6 +245,7 @@ def _whole(
         np.where(is_read, fitted.residual_m[nearest], np.nan),
         is_read & fitted.is_trusted[nearest],
         tuple(reasons),
+        fitted.unseen[nearest],
         source,
         seconds,
     )

@@ -84,6 +84,8 @@ class FittedFile:
     """[T]."""
     reasons: tuple[str, ...]
     """Per frame, why it is not trusted; empty for frames that are."""
+    unseen: NDArray[np.bool_]
+    """[T, J], joints that the scan does not show; their rotations are what is usual."""
     source: str
     """Digest of names and contents of the scans."""
     seconds: float
@@ -143,10 +145,13 @@ def write_fitted(folder: Path, fitted: FittedFile, made: FitMade, frame_rate: fl
     arrays = {
         "poses": fitted.poses @ world.turn,
         "trans": _file_points(fitted.translation, world),
+        "rest_up": np.array(world.up),  # for readers that do not read the skeleton beside them
+        "metres_per_unit": np.array(world.scale),
         "frame_rate": np.array(frame_rate),
         "trusted": fitted.is_trusted,
         "residual_m": fitted.residual_m,
         "reasons": np.array(fitted.reasons, np.str_),
+        "unseen": fitted.unseen,
         "source": np.array(fitted.source),
         "seconds": np.array(fitted.seconds),
         "fit": np.array(made.digest),
@@ -170,14 +175,16 @@ def read_fitted(folder: Path, made: FitMade, joints: int) -> FittedFile | None:
             np.asarray(arrays["residual_m"], np.float64),
             np.asarray(arrays["trusted"], bool),
             tuple(one_line(str(reason), LONGEST_REASON) for reason in arrays["reasons"]),
+            np.asarray(arrays["unseen"], bool),
             str(arrays["source"]),
             float(arrays["seconds"]),
         )
     except (UserError, KeyError, ValueError, TypeError, OverflowError):
         return None
     frames = len(fitted.reasons)
-    shapes = [fitted.poses.shape, fitted.translation.shape, fitted.residual_m.shape, fitted.is_trusted.shape]
-    is_whole = np.isfinite(fitted.residual_m).any() and shapes == [(frames, joints, 3), (frames, 3), (frames,), (frames,)]
+    shapes = [one.shape for one in (fitted.poses, fitted.translation, fitted.residual_m, fitted.is_trusted, fitted.unseen)]
+    wanted = [(frames, joints, 3), (frames, 3), (frames,), (frames,), (frames, joints)]
+    is_whole = np.isfinite(fitted.residual_m).any() and shapes == wanted
     numbers = [fitted.poses, fitted.translation, np.nan_to_num(fitted.residual_m, nan=0.0, posinf=np.inf), fitted.seconds]
     return fitted if is_whole and all((np.abs(array) < _LARGEST).all() for array in numbers) else None
 

@@ -227,7 +227,10 @@ def test_a_new_start_leaves_no_poses_of_the_earlier_fit(tmp_path: Path, me: Path
     assert (report["complete"], report["sequences"]) == (False, [])
 
 
-def test_another_body_in_the_same_file_is_noticed(tmp_path: Path, quick: pytest.MonkeyPatch) -> None:
+def test_the_content_of_a_body_file_counts_and_not_its_path(
+    tmp_path: Path, quick: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
     motion = animal_motion("trot", 2)
     write_animal_meshes(tmp_path / "meshes" / "me", make_animal(0.06), [motion])
     for path in (tmp_path / "meshes" / "me").rglob("*.*"):
@@ -236,8 +239,11 @@ def test_another_body_in_the_same_file_is_noticed(tmp_path: Path, quick: pytest.
     rig = tmp_path / "animal.glb"
     rig.write_bytes(animal_glb(make_animal(0.06), [motion]))
     fit.run(_config(tmp_path, skeleton=str(rig)))
+    rig = rig.rename(tmp_path / "moved.glb")
+    fit.run(_config(tmp_path, skeleton=str(rig)))
+    assert "1 of 1 sequence fitted already" in caplog.text
     rig.write_bytes(animal_glb(make_animal(0.08), [motion]))
-    with pytest.raises(UserError, match=r"fitted with other settings \(body_digest \w+ -> \w+\)"):
+    with pytest.raises(UserError, match=r"fitted with other settings \(.*body_digest \w+ -> \w+\)"):
         fit.run(_config(tmp_path, skeleton=str(rig)))
 
 

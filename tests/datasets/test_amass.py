@@ -226,7 +226,8 @@ def test_from_files_to_tables(few: Path, tmp_path: Path, caplog: pytest.LogCaptu
     folders = [f"data_root={tmp_path / 'data'}", f"output_root={tmp_path / 'out'}"]
     one = ["data=amass", "subject=clips"]
     assert main(["doctor", "data=amass", f"data.folder={few}", *folders]) == 0
-    assert f'usable; next: "snarf preprocess data=amass subject=clips data.folder={few}"' in caplog.text
+    settings = f"data=amass subject=clips data.folder={few} data_root={tmp_path / 'data'}"
+    assert f'usable; next: "snarf preprocess {settings}"' in caplog.text
     sampled = ["points_per_frame=160", "workers=2", "data.frame_step=4", "data.ood_frame_step=8", folders[0]]
     assert main(["preprocess", *one, f"data.folder={few}", *sampled]) == 0
     assert "4 train, 4 test, 4 ood frames" in caplog.text

@@ -61,7 +61,7 @@ def test_a_good_folder_is_usable_and_drawn(caplog, good):
     assert line_with(lines, "278 vertices, 552 faces, the same in all 6 frames")
     assert line_with(lines, "100 % of the joints are inside the meshes")
     assert "  poses           surface at a bone moves by 0.2 cm between frames (median of 18 bones, 6 frames)" in lines
-    assert f'usable; next: "snarf preprocess data=meshes subject=rex data.folder={good}"' in lines[-1]
+    assert lines[-1] == f'usable; next: "snarf preprocess data=meshes subject=rex data.folder={good} data_root=nowhere"'
     path = good.parent / "outputs" / "doctor" / "meshes_rex.png"
     assert str(path) in line_with(lines, "  figure ")
     picture = np.asarray(Image.open(path).convert("RGB")).astype(int)

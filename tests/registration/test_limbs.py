@@ -13,10 +13,10 @@ from snarfcli.motions import builtin_motion
 from snarfcli.registration.body_surface import BodyState, BodySurface
 from snarfcli.registration.joint_limits import random_poses
 from snarfcli.registration.limbs import Limb, doubtful_limbs, find_limbs, limb_candidates, squared_distances
+from snarfcli.registration.matches import agreement
 from snarfcli.registration.pose_library import PoseLibrary
 from snarfcli.registration.rotations import vector_to_matrix
 from snarfcli.registration.scan_grid import ScanGrid
-from snarfcli.registration.solver import agreement
 
 NUMBER = {name: number for number, name in enumerate(SMPL_JOINT_NAMES)}
 

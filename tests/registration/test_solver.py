@@ -9,8 +9,9 @@ import trimesh
 
 from snarfcli.bodies import builtin_body
 from snarfcli.registration.body_surface import BodyState, BodySurface
+from snarfcli.registration.matches import agreement
 from snarfcli.registration.scan_points import ScanPoints
-from snarfcli.registration.solver import PosePrior, agreement, fit_state, scales
+from snarfcli.registration.solver import PosePrior, fit_state, scales
 
 PRIOR = PosePrior.weak(24)
 

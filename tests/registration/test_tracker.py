@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scanned_person import BETAS, PRIOR, NearFinder, Person, surface
+from scipy.spatial import KDTree
 
 from snarfcli.registration.body_surface import BodyState
+from snarfcli.registration.matches import agreement
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.tracker import FittedSequence, fit_sequence
+from snarfcli.registration.trust import unseen_joints
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +84,24 @@ def test_frames_without_order_are_found_one_by_one(person):
     assert finder.calls == 12
     assert person.errors_m(states_of(fitted)).max() < 0.01
     assert fitted.is_trusted.all()
+
+
+def test_limbs_that_are_cut_off_are_known_as_not_seen(person):
+    class Cut:
+        def __len__(self) -> int:
+            return 3
+
+        def __getitem__(self, index: int) -> ScanPoints:
+            scan, body = person[index], surface(1200)
+            nearest = KDTree(body.posed(person.states[index]).points).query(scan.points)[1]
+            is_kept = ~np.isin(body.bones[nearest], [18, 20, 22])
+            return ScanPoints(scan.points[is_kept], scan.normals[is_kept])
+
+    fitted = fit_sequence(surface(), Cut(), NearFinder([near(person.states[1])], surface()), PRIOR, betas=BETAS)
+    names = [surface().joint_names[joint] for joint in np.flatnonzero(fitted.unseen.mean(0) > 0.5)]
+    assert names == ["l_elbow", "l_wrist", "l_hand"]
+    whole = [agreement(surface(), state, person[frame]) for frame, state in enumerate(person.states)]
+    assert np.mean([unseen_joints(one.partners, surface()) for one in whole], 0).max() < 0.3  # hands at the chest
 
 
 def test_a_body_without_shape_parameters_is_followed(person):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from snarfcli.registration.solver import Agreement
+from snarfcli.registration.matches import Agreement
 from snarfcli.registration.trust import apart_share, find_jumps, is_suspicious, judge, usual_misfit
 
 NAMES = ("root", "hand")

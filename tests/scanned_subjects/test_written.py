@@ -16,6 +16,7 @@ from snarfcli.datasets.registry import find_dataset
 from snarfcli.datasets.settings import DataConfig
 from snarfcli.datasets.sources import Request
 from snarfcli.files import write_arrays
+from snarfcli.motions import read_motion
 from snarfcli.scanned_subjects.written import (
     FitMade,
     FittedFile,
@@ -35,7 +36,7 @@ def fitted(frames: int = 2) -> FittedFile:
     poses, places = toy_poses(frames)
     trusted = np.arange(frames) > 0
     reasons = tuple("" if one else "far away" for one in trusted)
-    return FittedFile(poses, places, np.full(frames, 0.004), trusted, reasons, "abc", 3.0)
+    return FittedFile(poses, places, np.full(frames, 0.004), trusted, reasons, poses[..., 0] > 0.5, "abc", 3.0)
 
 
 @pytest.mark.parametrize(("scale", "up"), [(1.0, "y"), (0.001, "z")])
@@ -55,6 +56,10 @@ def test_the_files_are_those_of_a_subject(tmp_path: Path, scale: float, up: str)
     frame = spec.motion.num_frames - 1
     np.testing.assert_allclose(spec.motion.poses[frame], poses[frame], atol=1e-9)
     np.testing.assert_allclose(spec.motion.translation[frame], places[frame], atol=1e-9)
+    motion = read_motion(place / "walk" / "poses.npz", data.skeleton)  # as for --pose
+    assert (motion.name, motion.frame_rate) == ("walk", 25.0)
+    np.testing.assert_allclose(motion.poses, fitted().poses, atol=1e-9)
+    np.testing.assert_allclose(motion.translation, fitted().translation, atol=1e-9)
     vertices, _ = spec.meshes[frame]
     body = builtin_body().pose(torch.from_numpy(poses[[frame]]).float(), BETAS, torch.from_numpy(places[[frame]]).float())
     np.testing.assert_allclose(vertices, body.vertices[0].numpy(), atol=1e-4)

@@ -397,6 +397,8 @@ def test_what_is_missing_is_said(animal, tmp_path):
         meshes.load("cat", request(tmp_path))
     write(tmp_path, "poses", animal, motions("sit"))
     assert meshes.subjects(request(tmp_path)) == ("rex",)
+    with pytest.raises(UserError, match=r"got the file /a b/cat.glb; give 'data.folder=/a b' subject=cat"):
+        meshes.load("/a b/cat.glb", request(tmp_path))
     with pytest.raises(UserError, match=r"no subject 'rax' in .*; did you mean 'rex'"):
         meshes.load("rax", request(tmp_path))
     with pytest.raises(UserError, match=r"data.up: wanted auto, y or z, got 'x'"):

@@ -78,6 +78,8 @@ def test_the_page_plays_without_errors_and_without_a_network(path, tmp_path):
         assert changed(clay, drawn(page)) < 1e-3  # and comes back
         assert page.run("document.getElementById('bones').hidden")
         click(page, "weights")
+        box = "document.getElementById('{}').getBoundingClientRect().{}"
+        assert page.run(f"{box.format('bones', 'bottom')} <= {box.format('controls', 'top')}")
         coloured = drawn(page)
         assert np.quantile(vividness(coloured), 0.99) > 2 * np.quantile(vividness(clay), 0.99)
         assert page.run("document.getElementById('bones').children.length") == JOINTS

@@ -192,7 +192,9 @@
       drawn = size;
       draw.setSize(width, height, false);
       camera.aspect = width / height;
-      camera.setViewOffset(width, height, 0, at('controls').offsetHeight / 2, width, height);
+      const controls = at('controls').offsetHeight;  // of several lines in a narrow window
+      camera.setViewOffset(width, height, 0, controls / 2, width, height);
+      at('bones').style.bottom = `${controls + 20}px`;
     }
 
     let before = null;

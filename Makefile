@@ -12,8 +12,8 @@ C_FAMILY = $(shell find csrc benchmarks tests/native tests/pretend_gpu tests/tru
 .PHONY: help setup demo test lowest docs notebook platforms wheels fuzz trust sanitize lint format bench gpu clean
 
 help:
-	@echo "make setup     install snarf into $(VENV)"
-	@echo "make demo      run the whole pipeline on the built-in subject $(SUBJECT): samples, training, evaluation, animation"
+	@echo "make setup     install snarf into $(VENV), with what its tests need"
+	@echo "make demo      run the whole pipeline on the built-in subject $(SUBJECT): samples, training, animation, evaluation"
 	@echo "make test      run the tests"
 	@echo "make lowest    run the tests of files, samples, pictures and commands with the oldest packages that pyproject.toml allows"
 	@echo "make docs      build the documentation as a site, in build/site"
@@ -34,7 +34,11 @@ setup: $(INSTALLED)
 $(INSTALLED): pyproject.toml tools/set_up.sh CMakeLists.txt $(NATIVE)
 	PYTHON=$(PYTHON) tools/set_up.sh $(VENV)
 
-demo: $(INSTALLED)
+# The commands are enough for users: an installed snarf is taken as it is.
+$(SNARF):
+	PYTHON=$(PYTHON) tools/set_up.sh $(VENV) commands
+
+demo: $(SNARF)
 	$(SNARF) preprocess subject=$(SUBJECT)
 	$(SNARF) train subject=$(SUBJECT) training=quick run=demo resume=true
 	$(SNARF) animate subject=$(SUBJECT) run=demo resolution=128 max_frames=30 overwrite=true
@@ -42,6 +46,7 @@ demo: $(INSTALLED)
 	$(SNARF) eval --ood subject=$(SUBJECT) run=demo
 	@echo "avatar, tables and pictures: outputs/builtin/$(SUBJECT)/demo"
 	@echo "meshes and video:            outputs/builtin/$(SUBJECT)/demo/animation"
+	@echo "next: $(SNARF) export subject=$(SUBJECT) run=demo format=html"
 
 test: $(INSTALLED)
 	tools/fetch_nvrtc.sh $(VENV)

@@ -18,7 +18,7 @@ from snarf.deformer import WeightField, cells_near
 SUBJECTS = 3
 NODES = (12, 48, 40)  # of the grid, along z, y, x
 POINTS = 2000  # per scan and step
-SHARPNESS = 20.0  # of the softmax over the roots; the papers' value
+SHARPNESS = 20.0  # of the softmax over the roots; 5 in the released code of the papers, which give no number
 
 
 def network(inputs: int, outputs: int) -> nn.Sequential:

@@ -53,10 +53,11 @@ def find_avatar(output_root: str, data: str, subject: str, run: str, ckpt: str |
     if not (folder / "avatar.pt").is_file():
         trained = sorted(p.parent.name for p in folder.parent.glob("*/avatar.pt"))
         hint = f"; trained runs there: {', '.join(trained)}{nearest(run, trained)}" if trained else ""
+        other = f"give {shlex.quote(f'run={trained[0]}') if len(trained) == 1 else 'run=NAME'}, " if trained else ""
         settings = {"data": data, "subject": subject, "output_root": output_root, "run": run}
         usual = {"data": "builtin", "output_root": "outputs", "run": "fast_snarf"}
         chosen = " ".join(shlex.quote(f"{name}={value}") for name, value in settings.items() if value != usual.get(name))
-        raise UserError(f'no avatar in {folder}{hint}; run "snarf train {chosen}" or give ckpt=PATH')
+        raise UserError(f'no avatar in {folder}{hint}; {other}run "snarf train {chosen}" or give ckpt=PATH')
     return folder / "avatar.pt"
 
 

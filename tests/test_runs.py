@@ -24,6 +24,12 @@ def test_a_missing_avatar_names_runs_that_are_there(tmp_path):
     (tmp_path / "builtin" / "1" / "quick" / "avatar.pt").touch()
     with pytest.raises(UserError, match="trained runs there: quick; did you mean 'quick'"):
         find_avatar(str(tmp_path), "builtin", "1", "quik", None)
+    with pytest.raises(UserError, match=r'there: quick; give run=quick, run "snarf train subject=1 .*" or give ckpt'):
+        find_avatar(str(tmp_path), "builtin", "1", "fast_snarf", None)
+    (tmp_path / "builtin" / "1" / "slow").mkdir()
+    (tmp_path / "builtin" / "1" / "slow" / "avatar.pt").touch()
+    with pytest.raises(UserError, match="trained runs there: quick, slow; give run=NAME, run"):
+        find_avatar(str(tmp_path), "builtin", "1", "fast_snarf", None)
     assert find_avatar(str(tmp_path), "x", "y", "z", str(tmp_path / "builtin" / "1" / "quick")).name == "avatar.pt"
 
 

@@ -78,7 +78,8 @@ COMMAND_LIST = (
         "export",
         "export",
         "ExportConfig",
-        "write a rigged, animated character (glb, html, fbx, usd, vrm), its motion (bvh) or one mesh per frame (ply, obj)",
+        "write a rigged, animated character (glb, html, fbx, usd, vrm), its motion (bvh), one mesh per frame (ply, obj) or "
+        "the avatar itself with a model card (pretrained)",
         "snarf export --pose a.npz --pose b.bvh subject=50002",
         {"--pose": "pose=[{}]"},
     ),

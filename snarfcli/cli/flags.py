@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from snarfcli.cli.command_list import Command
-from snarfcli.errors import UserError, nearest
+from snarfcli.cli.hints import instead_of_argument, instead_of_flag
+from snarfcli.errors import UserError
 from snarfcli.hydra_config.overrides import quote, quote_items
 
 __all__ = ["translate_flags"]
@@ -64,9 +65,11 @@ class _Arguments:
                 self.hydra_flags.append(self.rest.pop(0))
         elif argument.startswith("-"):
             valid = [*self.command.flags, "--help", *_HYDRA_FLAGS]
-            raise UserError(f'unknown flag {argument!r}{nearest(argument, valid)}; see "snarf {self.command.name} --help"')
+            hint = instead_of_flag(self.command, argument, self.rest, valid)
+            raise UserError(f'unknown flag {argument!r}{hint}; see "snarf {self.command.name} --help"')
         elif not equals or argument.startswith("~"):
-            raise UserError(f'wanted a setting NAME=VALUE, got {argument!r}; see "snarf {self.command.name} --help"')
+            hint = instead_of_argument(self.command, argument)
+            raise UserError(f'wanted a setting NAME=VALUE, got {argument!r}{hint}; see "snarf {self.command.name} --help"')
         else:
             self.given_settings.add(name)
             is_list = name in self.command.lists_of_settings

@@ -18,7 +18,7 @@ from omegaconf import MISSING
 
 import snarfcli
 from snarfcli.commands.doctor_findings import Finding, promises
-from snarfcli.commands.doctor_tools import TOOLS, describe_error, package_finding, tools
+from snarfcli.commands.doctor_tools import TOOLS, describe_error, extras, package_finding, tools
 from snarfcli.datasets.settings import DataConfig, command_settings
 from snarfcli.errors import UserError
 from snarfcli.parallel import count_cores
@@ -87,6 +87,7 @@ def run(config: DoctorConfig) -> int:
         "processor": _processor,
         "GPU": _gpu,
         "tools": tools,
+        "extras, each optional": extras,
         "data": lambda: _data(Path(config.data_root), Path(config.output_root)),
         "what is promised (docs/promises.md)": lambda: promises(Path(config.data_root), Path(config.output_root)),
     }

@@ -9,7 +9,7 @@ from snarfcli.commands.doctor_findings import Finding
 from snarfcli.texts import one_line
 from snarfcli.versions import installed_version
 
-__all__ = ["TOOLS", "describe_error", "package_finding", "tools"]
+__all__ = ["EXTRAS", "TOOLS", "describe_error", "extras", "package_finding", "tools"]
 
 TOOLS = {"embreex": "embreex.rtcore_scene", "libigl": "igl", "pymeshlab": "pymeshlab"}
 """Compiled packages that are imported to see whether they work, and the module that shows it."""
@@ -20,12 +20,29 @@ _INSTEAD = {
 """What is used where a package is missing."""
 _LICENCES = {"pymeshlab": "licence GPL-3; can be left out: poisson=own, and libigl decimates"}
 
+EXTRAS = {
+    "view": ("viser", "snarf view"),
+    "hub": ("huggingface-hub", "avatars of the Hugging Face Hub, Avatar.from_pretrained"),
+    "blender": ("bpy", "snarf export format=fbx and usd; a blender on the PATH serves too"),
+    "joblib": ("hydra-joblib-launcher", "several runs at a time, launcher=joblib"),
+    "submitit": ("hydra-submitit-launcher", "runs on a cluster, launcher=submitit_slurm"),
+}
+"""Extras of single functions: the package that each brings, and what needs it."""
+
 
 def tools() -> Iterator[Finding]:
     """Yield ffmpeg and the compiled packages."""
     yield _ffmpeg()
     for package, module in TOOLS.items():
         yield package_finding("embree" if package == "embreex" else package, package, module)
+
+
+def extras() -> Iterator[Finding]:
+    """Yield the extras of single functions. None is a fallback: what needs one says so when it is used."""
+    for extra, (package, purpose) in EXTRAS.items():
+        installed = installed_version(package)
+        missing = f"not installed; for {purpose}: pip install 'snarf[{extra}]'"
+        yield Finding(extra, missing if installed is None else f"{package} {installed}, for {purpose}")
 
 
 def package_finding(name: str, package: str, module: str | None = None) -> Finding:

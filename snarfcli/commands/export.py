@@ -1,4 +1,4 @@
-"""`snarf export`: write an avatar as a rigged, animated character for other programs, or its motions."""
+"""`snarf export`: write an avatar as a rigged, animated character for other programs, its motions, or itself."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from snarfcli.commands.export_places import (
     write_record,
     writing,
 )
+from snarfcli.commands.export_pretrained import write_folder
 from snarfcli.commands.export_settings import ExportConfig, check_settings
 from snarfcli.commands.selection import load_selected_avatar
 from snarfcli.errors import UserError
@@ -54,6 +55,8 @@ def run(config: ExportConfig) -> int:
     options = check_settings(config)
     if config.format == "bvh":
         return write_motions(config)
+    if config.format == "pretrained":
+        return write_folder(config)
     blender = find_blender() if config.format in BLENDER_FORMATS else []
     if config.output is not None:  # before the avatar is loaded
         check_place(config, Path(config.output))

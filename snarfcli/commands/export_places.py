@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from snarfcli.avatar import Avatar
-from snarfcli.commands.export_settings import FORMATS, ExportConfig
+from snarfcli.commands.export_settings import FOLDER_FORMATS, FORMATS, ExportConfig
 from snarfcli.commands.selection import BUILTIN_MOTIONS, select_motion
 from snarfcli.errors import UserError
 from snarfcli.export.character import CharacterOptions
@@ -20,6 +21,7 @@ from snarfcli.export.export import check_output
 from snarfcli.export.sequence import check_folder, tidy_folder
 from snarfcli.files import atomic_path, read_json, remove_temporaries, write_json
 from snarfcli.meshing.mesh_files import MESH_WRITERS
+from snarfcli.models.pretrained import CARD_FILE, CONFIG_FILE, TENSORS_FILE
 from snarfcli.names import folder_name, folder_names
 from snarfcli.output_locks import clear_killed, hold_output
 
@@ -39,6 +41,7 @@ log = logging.getLogger(__name__)
 
 _GROUND_RESOLUTION = 128
 _RECORD = "export.json"
+_PRETRAINED = re.compile("|".join(map(re.escape, (CARD_FILE, CONFIG_FILE, TENSORS_FILE))))
 
 
 def subject_name(config: ExportConfig, avatar: Avatar) -> str:
@@ -47,8 +50,8 @@ def subject_name(config: ExportConfig, avatar: Avatar) -> str:
 
 
 def default_place(config: ExportConfig, folder: Path, subject: str) -> Path:
-    """Return the default output: a file, or a folder for meshes."""
-    joint = "_" if config.format in MESH_WRITERS else "."
+    """Return the default output: a file, or a folder for meshes and pretrained avatars."""
+    joint = "_" if config.format in FOLDER_FORMATS else "."
     return folder / "export" / f"{subject}{joint}{config.format}"
 
 
@@ -63,9 +66,11 @@ def check_place(config: ExportConfig, output: Path) -> Path:
     clear_killed(output)
     if config.format in MESH_WRITERS:
         return check_folder(output, config.overwrite)
+    if config.format == "pretrained":
+        return check_folder(output, _may_replace(config, output), _PRETRAINED)
     suffix = output.suffix.lower().lstrip(".")
     if suffix != config.format:
-        hint = f"give format={suffix}, or " if suffix in FORMATS and suffix not in MESH_WRITERS else ""
+        hint = f"give format={suffix}, or " if suffix in FORMATS and suffix not in FOLDER_FORMATS else ""
         raise UserError(f"output: wanted a name ending in .{config.format}, got {output}; {hint}give another name")
     overwrite = _may_replace(config, output)
     check_output(output, overwrite)
@@ -74,8 +79,11 @@ def check_place(config: ExportConfig, output: Path) -> Path:
 
 
 def record_file(config: ExportConfig, output: Path) -> Path:
-    """Return the file of the record: in the folder of meshes, or beside the output file."""
-    return output / _RECORD if config.format in MESH_WRITERS else output.with_name(f"{output.stem}_{output.suffix[1:]}.json")
+    """Return the file of the record: in the folder of meshes, or beside the output, as what is passed on names no paths."""
+    if config.format in MESH_WRITERS:
+        return output / _RECORD
+    name = output.name if config.format == "pretrained" else f"{output.stem}_{output.suffix[1:]}"
+    return output.with_name(f"{name}.json")
 
 
 def clip_files(config: ExportConfig, output: Path, names: Sequence[str], suffix: str) -> list[Path]:
@@ -127,6 +135,8 @@ def writing(config: ExportConfig, output: Path, files: Sequence[Path] = ()) -> I
             check_place(config, output)
             yield
             return
+        if config.format == "pretrained":
+            tidy_folder(output)
         check_place(config, output)
         record = record_file(config, output)
         places = (output, *files)

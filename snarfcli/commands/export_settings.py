@@ -18,12 +18,14 @@ from snarfcli.export.joint_naming import NAMINGS
 from snarfcli.export.vrm_meta import VrmMeta, check_meta
 from snarfcli.meshing.mesh_files import MESH_WRITERS
 
-__all__ = ["FORMATS", "BvhConfig", "ExportConfig", "check_settings"]
+__all__ = ["FOLDER_FORMATS", "FORMATS", "BvhConfig", "ExportConfig", "PretrainedConfig", "check_settings"]
 
 log = logging.getLogger(__name__)
 
-FORMATS = ("glb", "html", "vrm", "bvh", *MESH_WRITERS, *BLENDER_FORMATS)
+FORMATS = ("glb", "html", "vrm", "bvh", "pretrained", *MESH_WRITERS, *BLENDER_FORMATS)
 """Choices for the format."""
+FOLDER_FORMATS = ("pretrained", *MESH_WRITERS)
+"""Formats that are a folder."""
 _SKELETONS = ("avatar", "file")
 
 
@@ -40,6 +42,14 @@ class BvhConfig:
 
 
 @dataclass
+class PretrainedConfig:
+    """Settings of format=pretrained."""
+
+    license: str | None = None
+    """Licence of the avatar in its model card, a sentence; null for that of the data set."""
+
+
+@dataclass
 class ExportConfig(MotionSelection, AvatarSelection):
     """Settings of `snarf export`."""
 
@@ -51,7 +61,8 @@ class ExportConfig(MotionSelection, AvatarSelection):
     format: str = MISSING
     """glb (mesh, rig, clips and shapes in one file), html (the same as a page that plays offline, at most 5 MB), fbx or usd
     (the same, needs Blender), vrm (the same for VRM 1.0, with one .vrma per clip), bvh (the motion only, one file per clip),
-    ply or obj (one mesh per frame)."""
+    ply or obj (one mesh per frame), pretrained (the avatar itself, as Avatar.from_pretrained and ckpt=FOLDER read it, with a
+    model card)."""
     names: str | None = MISSING
     """Names of the joints of a human: smpl, mixamo, vrm or unreal; null for the skeleton's own."""
     skeleton: str = MISSING
@@ -75,8 +86,10 @@ class ExportConfig(MotionSelection, AvatarSelection):
     """Settings of format=vrm."""
     html: HtmlConfig = field(default_factory=HtmlConfig)
     """Settings of format=html."""
+    pretrained: PretrainedConfig = field(default_factory=PretrainedConfig)
+    """Settings of format=pretrained."""
     output: str | None = MISSING
-    """Output file, or folder for ply and obj; null for export/<subject>.<format> beside the avatar."""
+    """Output file, or folder for ply, obj and pretrained; null for export/<subject>.<format> beside the avatar."""
     overwrite: bool = MISSING
     """Replace existing output."""
     wait: bool = False
@@ -128,5 +141,7 @@ def _report_unused(config: ExportConfig) -> None:
         if given:
             text = "%s: not used with format=%s, whose meshes have all weights and the exact shape"
             log.warning(text, ", ".join(given), config.format)
+    if config.format == "pretrained" and (config.pose or config.motion):
+        log.warning("pose, motion: not used with format=pretrained, which is the avatar without motions")
     if config.format != "bvh" and config.skeleton != "avatar":
         log.warning("skeleton=%s: not used with format=%s", config.skeleton, config.format)

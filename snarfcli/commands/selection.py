@@ -217,6 +217,8 @@ def _read(
 ) -> tuple[Motion, NDArray[np.float32] | None]:
     """Return the whole motion, y up, and its bone transforms if joints stretch."""
     if pose is not None:
+        if not Path(pose).exists():
+            raise UserError(f"no pose file at {pose}; give the path of one, or motion=NAME for a motion that needs no file")
         motion = read_motion(
             pose,
             skeleton,

@@ -28,7 +28,7 @@ _LICENSES = {
     "poseprior": DataLicense("other", f"Not for redistribution: {_SMPL}"),
     "cape": DataLicense("other", "Not for redistribution: made from CAPE, for research only: https://cape.is.tue.mpg.de."),
 }
-_UNKNOWN = DataLicense("other", "No licence is stated: that of the data from which it was made applies.")
+_UNKNOWN = DataLicense("other", "None is stated; that of the data from which it was made applies.")
 
 
 def license_of(facts: dict[str, Any]) -> DataLicense:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from snarfcli.datasets.rigged import RIG_SUFFIXES
@@ -72,8 +73,9 @@ def find_subject(subject: str, request: Request) -> Path:
     """Return the folder or rigged file of a subject.
 
     Raises:
-        UserError: it does not exist, or lacks a skeleton.
+        UserError: it does not exist, lacks a skeleton, or is given as a file.
     """
+    _check_name(subject, request)
     places = subject_places(request)
     if subject in places:
         return places[subject]
@@ -83,6 +85,21 @@ def find_subject(subject: str, request: Request) -> Path:
         raise UserError(missing_parts(there))
     known = f"; wanted one of {', '.join(list(places)[:8])}" if places else ""
     raise UserError(f"no subject '{subject}' in {folder}{nearest(subject, places) or known}")
+
+
+def _check_name(subject: str, request: Request) -> None:
+    """Raise UserError for a subject that is given as the path of a rigged file, and not by its name."""
+    path = Path(subject)
+    if path.suffix.lower() not in RIG_SUFFIXES:
+        return
+    usual = (request.folder if request.config.folder is not None else request.data_root / "meshes") / path.name
+    if path.parent != Path():
+        settings = shlex.join([f"data.folder={path.parent}", f"subject={path.stem}"])
+    elif usual.is_file():
+        settings = shlex.quote(f"subject={path.stem}")
+    else:
+        return
+    raise UserError(f"subject: wanted the name of a subject, got the file {subject}; give {settings}")
 
 
 def missing_parts(folder: Path) -> str:

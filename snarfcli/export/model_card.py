@@ -14,7 +14,7 @@ from snarfcli.files import read_json
 from snarfcli.models.trained_field import TrainedField
 from snarfcli.texts import markdown_text, plain_markdown
 
-__all__ = ["model_card"]
+__all__ = ["evaluations", "model_card"]
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ def model_card(avatar: TrainedField, run: Path | None, license: str | None) -> s
     known = license_of(facts)
     identifier = known.identifier if license is None else "other"
     subject = markdown_text(facts.get("subject", "unknown"))
-    rows = [row for title, folder in _SPLITS if (row := _row(title, run, folder, facts)) is not None]
+    rows = list(_rows(run, facts).values())
     table = [
         f"| | frames | {' | '.join(title for title, _ in _COLUMNS)} |",
         f"|---|---|{'---|' * len(_COLUMNS)}",
@@ -88,7 +88,18 @@ def model_card(avatar: TrainedField, run: Path | None, license: str | None) -> s
 _TRAINING = (("data", "data"), ("subject", "subject"), ("preset", "training"), ("steps", "steps"), ("seed", "seed"))
 
 
-def _row(title: str, run: Path | None, folder: str, facts: dict[str, Any]) -> str | None:
+def evaluations(avatar: TrainedField, run: Path | None) -> tuple[str, ...]:
+    """Return which evaluations the card of an avatar has: "in distribution", "out of distribution", both or none."""
+    return tuple(_rows(run, avatar.facts, log_reasons=False))
+
+
+def _rows(run: Path | None, facts: dict[str, Any], *, log_reasons: bool = True) -> dict[str, str]:
+    """Return the rows of the table by their titles; perhaps log why results are left out."""
+    rows = {title: _row(title, run, folder, facts, log_reasons) for title, folder in _SPLITS}
+    return {title: row for title, row in rows.items() if row is not None}
+
+
+def _row(title: str, run: Path | None, folder: str, facts: dict[str, Any], log_reasons: bool) -> str | None:
     """Return the row of one evaluation, or None if there is none of this avatar."""
     path = None if run is None else run / folder / "metrics.json"
     if path is None or not path.is_file():
@@ -97,10 +108,12 @@ def _row(title: str, run: Path | None, folder: str, facts: dict[str, Any]) -> st
         content = read_json(path, "results of snarf eval")
         check_plain(content, "metrics", finite=False)
     except (UserError, DescriptionError) as error:
-        log.warning("%s: left out of the model card (%s)", path, error)
+        if log_reasons:
+            log.warning("%s: left out of the model card (%s)", path, error)
         return None
     if not isinstance(content, dict) or content.get("training") != facts:
-        log.warning("%s: left out of the model card, since it is of another avatar; evaluate this one again", path)
+        if log_reasons:
+            log.warning("%s: left out of the model card, since it is of another avatar; evaluate this one again", path)
         return None
     return f"| {title} | {_said(content.get('frames'))} | {' | '.join(_percent(content.get(name)) for _, name in _COLUMNS)} |"
 

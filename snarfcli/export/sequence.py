@@ -29,11 +29,16 @@ __all__ = ["atomic_folder", "check_folder", "tidy_folder", "write_sequence"]
 log = logging.getLogger(__name__)
 
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{8}\.(?P<kind>tmp|old)")
-_OURS = re.compile(r"frame_\d{6}\.(ply|obj)|export\.json")
+_FRAMES = re.compile(r"frame_\d{6}\.(ply|obj)|export\.json")
 
 
-def check_folder(folder: Path, overwrite: bool) -> Path:
-    """Check that a folder can be written: it is empty, or contains only frames and `overwrite` is True.
+def check_folder(folder: Path, overwrite: bool, ours: re.Pattern[str] = _FRAMES) -> Path:
+    """Check that a folder can be written: it is empty, or contains only files of an export and `overwrite` is True.
+
+    Args:
+        folder: the folder.
+        overwrite: whether files of an export are replaced.
+        ours: names of the files of an export; by default those of frames.
 
     Returns:
         The folder with links resolved: it is replaced as a whole, and a link to it stays.
@@ -58,9 +63,9 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
     there = [path for path in place.rglob("*") if path.is_symlink() or not path.is_dir()] if place.is_dir() else []
     if there and not overwrite:
         raise UserError(f"{folder} contains {there[0].name} already; give overwrite=true to replace it, or output=FOLDER")
-    foreign = [path for path in there if path.is_symlink() or not _OURS.fullmatch(path.name)]
+    foreign = [path for path in there if path.is_symlink() or not ours.fullmatch(path.name)]
     if foreign:
-        raise UserError(f"{folder}: wanted only frames of an export, got {foreign[0].name}; give output=FOLDER")
+        raise UserError(f"{folder}: wanted only files of such an export, got {foreign[0].name}; give output=FOLDER")
     return place
 
 

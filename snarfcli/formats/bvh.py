@@ -54,7 +54,7 @@ def read_bvh(path: str | Path) -> Rig:
     if path.is_dir():
         raise UserError(f"BVH file {path} is a folder; name a .bvh file")
     if not path.is_file():
-        raise UserError(f"no BVH file at {path}")
+        raise UserError(f"no BVH file at {path}; give the path of one")
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             lines = BvhLines(file, path)

@@ -291,7 +291,8 @@ def _read_limited(path: Path, owner: Path, limit: int) -> bytes:
     what = f"glTF file {owner}" if path == owner else f"glTF file {owner}: its buffer {path.name!r:.80}"
     try:
         if not path.exists():
-            raise UserError(f"no glTF file at {owner}" if path == owner else f"{what} is missing; copy it beside the file")
+            none = f"no glTF file at {owner}; give the path of one"
+            raise UserError(none if path == owner else f"{what} is missing; copy it beside the file")
         if not path.is_file():  # reading a pipe would block forever
             raise UserError(f"{what} is not a file; name a .glb or .gltf file")
         if path.stat().st_size > limit:

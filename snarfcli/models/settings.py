@@ -18,7 +18,7 @@ class ModelConfig:
     """How the correspondences of a point are blended in training: logit (softmax-weighted mean of the logits) or probability
     (softmax-weighted mean of the occupancies, as in the papers); only for forward skinning."""
     blend_sharpness: float = 1.0
-    """Factor before the softmax of the blend (5 on occupancies in the released code)."""
+    """Factor before the softmax of the blend (5 on occupancies in the released code; the papers give no number)."""
     components: int | None = None
     """Number of connected pieces of the canonical shape that a finished avatar keeps, largest first; null keeps all pieces
     that points inside the training meshes need. Only for forward skinning."""

@@ -123,7 +123,7 @@ def read_motion_and_source(
         found = retarget_rig(rig, chosen, skeleton, path=path, name=name, up=up, rest=rest, mapping=mapping)
         return found.motion, found
     if not path.exists():
-        raise UserError(f"no pose file at {path}")
+        raise UserError(f"no pose file at {path}; give the path of one")
     if suffix not in POSE_SUFFIXES and not path.is_dir():
         wanted = f"a file ending in {', '.join(MOTION_SUFFIXES)}, or a folder of pose files"
         raise UserError(f"pose file {path}: wanted {wanted}; convert it")

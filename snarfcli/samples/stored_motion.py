@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,9 +13,13 @@ from snarfcli.errors import UserError, nearest
 from snarfcli.motions import Motion
 from snarfcli.samples.sequence import SequenceSamples
 from snarfcli.samples.store import SampleStore
+from snarfcli.texts import one_line
 
 __all__ = ["stored_motion"]
 
+log = logging.getLogger(__name__)
+
+_LISTED, _LONGEST_NAME = 12, 60
 _TOLERANCE = 1e-3  # of the entries of a bone transform (metres, rotation): poses within it reproduce the transforms
 
 
@@ -54,9 +60,13 @@ def stored_motion(
 def _choose(store: SampleStore, name: str | None) -> SequenceSamples:
     """Return the sequence of a name; None for the first in the order test, ood, train."""
     sequences = sorted(store.all_sequences, key=lambda sequence: ("test", "ood", "train").index(sequence.split))
-    if name is None:
-        return sequences[0]
     known = [sequence.name for sequence in sequences]
+    if name is None:
+        if others := known[1:]:
+            more = f" and {len(others) - _LISTED} more" if len(others) > _LISTED else ""
+            listed = ", ".join(one_line(other, _LONGEST_NAME) for other in others[:_LISTED])
+            log.info("motion=%s is taken; there are also %s%s", one_line(known[0], _LONGEST_NAME), listed, more)
+        return sequences[0]
     if name not in known:
         raise UserError(f"the samples have no sequence '{name}'{nearest(name, known)}; there is {', '.join(known)}")
     return sequences[known.index(name)]

@@ -123,7 +123,7 @@ def _line(recent: History, validation: dict[str, float], points_per_second: floa
     if lost:
         parts.append(f"lost {100 * lost:.2f} % of inside points")
     if validation:
-        parts.append(f"IoU {100 * validation['iou_bbox']:.1f}/{100 * validation['iou_surface']:.1f}")
+        parts.append(f"IoU bbox {100 * validation['iou_bbox']:.1f} surface {100 * validation['iou_surface']:.1f}")
     return ", ".join(parts)
 
 

@@ -340,7 +340,7 @@ def test_an_avatar_without_any_surface_still_ends_in_order(config, toy):
             "motion: wanted one for the avatar's 2 joints, got jumping_jacks, .* 24; give .* by --pose FILE",
         ),
         ({"pose": None, "motion": "jumping_jaks"}, "did you mean 'jumping_jacks'"),
-        ({"pose": "nowhere.npz"}, "no pose file at nowhere.npz"),
+        ({"pose": "nowhere.npz"}, "no pose file at nowhere.npz; give the path of one, or motion=NAME"),
         ({"subject": "50003"}, "no built-in subject '50003'"),
         ({"subject": "50004"}, 'no avatar in .*50004.*; run "snarf train subject=50004 output_root=.*" or give ckpt=PATH'),
         ({"ckpt": "nowhere.pt"}, "no avatar at nowhere.pt"),

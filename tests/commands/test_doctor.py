@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 from fake_gpus import FakeDriver, install_gpus
@@ -63,6 +64,29 @@ def test_what_stands_in_for_a_missing_package_is_named(caplog, tmp_path, monkeyp
     assert told in lines[name]
     assert lines[name].endswith(f'; run "pip install {package}"')
     assert name in lines["end"]
+
+
+def test_the_extras_of_single_functions_are_told(caplog, tmp_path, monkeypatch):
+    versions = {"viser": "1.2", "bpy": "5.0"}
+    there = doctor_tools.installed_version
+    packages = {package for package, _ in doctor_tools.EXTRAS.values()}
+    monkeypatch.setattr(doctor_tools, "installed_version", lambda one: versions.get(one) if one in packages else there(one))
+    lines = report(caplog, tmp_path, tmp_path)
+    assert lines["view"] == "viser 1.2, for snarf view"
+    assert lines["hub"].startswith("not installed; for avatars of the Hugging Face Hub")
+    assert lines["hub"].endswith(": pip install 'snarf[hub]'")
+    assert "hub" not in lines["end"]
+
+
+def test_every_extra_for_users_is_told():
+    """Those of the commands themselves, of the tests and of the documentation are no single functions."""
+    tomllib = pytest.importorskip("tomllib")  # Python 3.11
+    content = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))
+    declared = content["project"]["optional-dependencies"]
+    users = {name for name in declared if not name.startswith(("commands", "test", "docs"))}
+    assert users == set(doctor_tools.EXTRAS)
+    for name, (package, _) in doctor_tools.EXTRAS.items():
+        assert any(requirement.startswith(f"{package}>=") for requirement in declared[name])
 
 
 def test_data_and_avatars_are_found(caplog, tmp_path):

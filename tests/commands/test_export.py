@@ -153,7 +153,7 @@ def test_a_mesh_a_frame(folder, toy, capsys, suffix):
     (place / "notes.txt").write_text("mine")
     code, err = export(capsys, *arguments, "overwrite=true")
     assert code == 2
-    assert ": wanted only frames of an export, got notes.txt" in err
+    assert ": wanted only files of such an export, got notes.txt" in err
     assert (place / "notes.txt").exists()
 
 
@@ -194,7 +194,7 @@ def test_folders_that_cannot_be_replaced_are_rejected_at_once(folder, toy, capsy
         ),
         ("..", "..: wanted a folder that can be replaced as a whole"),
         ("circle", "circle: wanted a folder, got a link that cannot be resolved"),
-        ("links", "links: wanted only frames of an export, got frame_000000.ply"),
+        ("links", "links: wanted only files of such an export, got frame_000000.ply"),
         ("walk.npz", "walk.npz: wanted a folder, got a file"),
     ):
         code, err = export(capsys, *arguments, f"output={place}")

@@ -161,7 +161,7 @@ def test_the_axes_of_a_file_are_guessed_if_they_matter(capsys, caplog):
         (["skeleton=file", "height=ground"], "height: wanted file or auto with skeleton=file"),
         (["skeleton=file", "--pose", "dance.bvh", "bvh.units=m"], "bvh.units: wanted auto for the skeleton of dance.bvh"),
         (["skeleton=file", "--pose", "worm.bvh", "names=vrm"], "names=vrm: wanted the skeleton of a human, got one without"),
-        (["skeleton=file", "--pose", "nowhere.bvh"], "no BVH file at nowhere.bvh"),
+        (["skeleton=file", "--pose", "nowhere.bvh"], "no BVH file at nowhere.bvh; give the path of one"),
         (["skeleton=file", "motion=[lunge]"], "did you mean 'lunges'"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

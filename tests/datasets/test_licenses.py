@@ -23,7 +23,7 @@ def test_licensed_data_may_not_be_passed_on(data):
 @pytest.mark.parametrize("facts", [{}, {"data": None}, {"data": "meshes"}, {"data": "amass"}, {"data": ["builtin"]}])
 def test_of_other_data_nothing_is_claimed(facts):
     assert license_of(facts).identifier == "other"
-    assert license_of(facts).text.startswith("No licence is stated")
+    assert license_of(facts).text.startswith("None is stated")
 
 
 def test_every_data_set_has_an_answer():

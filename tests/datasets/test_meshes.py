@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -177,7 +178,7 @@ def test_topology_may_change_and_meshes_may_have_holes(animal, tmp_path):
     assert 0.25 < min(inside) <= max(inside) < 0.75  # near the surface; a hole empties nothing
 
 
-def test_transforms_that_stretch_are_kept(animal, tmp_path):
+def test_transforms_that_stretch_are_kept(animal, tmp_path, caplog):
     write(tmp_path, "transforms", animal, motions("walk", "sit"))
     motion = animal_motion("walk", FRAMES)
     moved = transforms_of(animal, motion)
@@ -191,7 +192,9 @@ def test_transforms_that_stretch_are_kept(animal, tmp_path):
     preprocess_subject(subject, tmp_path / "data", SAMPLING, {"train": 1, "test": 1, "ood": 1})
     store = SampleStore.open(tmp_path / "data", "meshes", "rex")
     np.testing.assert_allclose(store.sequences("test")[0].bone_transforms, moved, atol=1e-6)
-    motion, transforms = stored_motion(str(tmp_path / "data"), "meshes", "rex", None, store.skeleton)
+    with caplog.at_level(logging.INFO):
+        motion, transforms = stored_motion(str(tmp_path / "data"), "meshes", "rex", None, store.skeleton)
+    assert "motion=walk is taken; there are also sit" in caplog.text
     assert motion.name == "walk"
     assert motion.num_frames == FRAMES
     np.testing.assert_allclose(transforms, moved, atol=1e-6)
@@ -397,6 +400,8 @@ def test_what_is_missing_is_said(animal, tmp_path):
         meshes.load("cat", request(tmp_path))
     write(tmp_path, "poses", animal, motions("sit"))
     assert meshes.subjects(request(tmp_path)) == ("rex",)
+    with pytest.raises(UserError, match=r"got the file /a b/cat.glb; give 'data.folder=/a b' subject=cat"):
+        meshes.load("/a b/cat.glb", request(tmp_path))
     with pytest.raises(UserError, match=r"no subject 'rax' in .*; did you mean 'rex'"):
         meshes.load("rax", request(tmp_path))
     with pytest.raises(UserError, match=r"data.up: wanted auto, y or z, got 'x'"):

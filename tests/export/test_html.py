@@ -141,7 +141,7 @@ def test_title_and_licence_are_chosen_or_those_of_the_data(exported, tmp_path):
     page = (tmp_path / "b.html").read_text(encoding="utf-8")
     assert report.clips[0].frames == 1
     assert "<h1>worm</h1>" in page
-    assert "Licence: No licence is stated" in page
+    assert "Licence: None is stated" in page
 
 
 def test_what_does_not_fit_is_reduced_and_said(monkeypatch, tmp_path):

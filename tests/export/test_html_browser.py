@@ -78,6 +78,12 @@ def test_the_page_plays_without_errors_and_without_a_network(path, tmp_path):
         assert changed(clay, drawn(page)) < 1e-3  # and comes back
         assert page.run("document.getElementById('bones').hidden")
         click(page, "weights")
+        box = "document.getElementById('{}').getBoundingClientRect().{}"
+        for width in ("auto", "200px"):  # the controls become higher without another size of the window
+            page.run(f"document.getElementById('controls').style.width = '{width}'")
+            drawn(page)
+            assert page.run(f"{box.format('bones', 'bottom')} <= {box.format('controls', 'top')}")
+        page.run("document.getElementById('controls').style.width = 'auto'")
         coloured = drawn(page)
         assert np.quantile(vividness(coloured), 0.99) > 2 * np.quantile(vividness(clay), 0.99)
         assert page.run("document.getElementById('bones').children.length") == JOINTS

@@ -65,7 +65,7 @@ def test_nothing_is_claimed_that_is_not_known():
     assert "license: other" in card
     assert "# Avatar of unknown" in card
     assert "Not evaluated.\n" in card
-    assert "No licence is stated" in card
+    assert "None is stated" in card
     assert "license: other" in model_card(tiny_avatar(), None, "All rights reserved.")
     assert "\nAll rights reserved.\n" in model_card(tiny_avatar(), None, "All rights reserved.")
 

@@ -187,12 +187,14 @@
     let drawn = '';
     function fit() {  // the page, above its controls
       const [width, height] = [Math.max(window.innerWidth, 1), Math.max(window.innerHeight, 1)];
-      const size = `${width} ${height}`;
+      const controls = at('controls').offsetHeight;  // their lines change with what they say
+      const size = `${width} ${height} ${controls}`;
       if (size === drawn) return;
       drawn = size;
       draw.setSize(width, height, false);
       camera.aspect = width / height;
-      camera.setViewOffset(width, height, 0, at('controls').offsetHeight / 2, width, height);
+      camera.setViewOffset(width, height, 0, controls / 2, width, height);
+      at('bones').style.bottom = `${controls + 20}px`;
     }
 
     let before = null;

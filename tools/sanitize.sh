@@ -6,7 +6,7 @@ set -eu
 venv=$(cd "$1" && pwd)
 shift
 cd "$(dirname "$0")/.."
-[ $# -gt 0 ] || set -- tests/deformer/test_gradient.py tests/native/test_library.py tests/deformer/test_native_search.py tests/deformer/test_ops.py tests/deformer/test_posed.py tests/deformer/test_search.py tests/deformer/test_starts.py tests/shape/test_inference.py tests/networks tests/native/test_threads.py tests/training/test_optimizer.py tests/deformer/test_weights.py
+[ $# -gt 0 ] || set -- tests/deformer/test_gradient.py tests/native/test_library.py tests/deformer/test_native_search.py tests/deformer/test_ops.py tests/deformer/test_posed.py tests/deformer/test_posed_gradients.py tests/deformer/test_posed_skinning.py tests/deformer/test_search.py tests/deformer/test_starts.py tests/shape/test_inference.py tests/networks tests/native/test_threads.py tests/training/test_optimizer.py tests/deformer/test_weights.py
 folder=$PWD/build/sanitize
 compiler=${CXX:-c++}
 "$venv/bin/cmake" -S . -B "$folder" -G Ninja -DCMAKE_MAKE_PROGRAM="$venv/bin/ninja" -DSNARF_SANITIZE=ON -DSNARF_REQUIRE_NATIVE=ON

@@ -4,6 +4,7 @@ import snarfcli.extras.commands  # noqa: F401 - raises MissingPackage
 from snarfcli.point_clouds.bone_sides import bone_normals
 from snarfcli.point_clouds.closing import close_surface
 from snarfcli.point_clouds.files import PointFile, list_frames, read_frame, read_points
+from snarfcli.point_clouds.neighbours import point_areas
 from snarfcli.point_clouds.normals import CheckedNormals, check_normals, estimate_normals
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "close_surface",
     "estimate_normals",
     "list_frames",
+    "point_areas",
     "read_frame",
     "read_points",
 ]

@@ -43,6 +43,8 @@ class CheckedNormals:
     """[N, 3], unit length, outward."""
     change: str
     """What was changed, for messages, such as "pointed inward and were turned"; empty if nothing was."""
+    is_estimated: bool = False
+    """Whether they were given up, and estimated by the points alone."""
 
 
 def estimate_normals(points: Array) -> Array:
@@ -80,7 +82,7 @@ def check_normals(points: Array, normals: Array) -> CheckedNormals:
     given = np.where(is_given[:, None], normals, estimated) / np.where(is_given[:, None], length, 1.0)
     along = (given * estimated).sum(axis=1)
     if np.median(np.abs(along)) < _NO_NORMALS or not is_given.any():
-        return CheckedNormals(estimated, "were not normal to the surface and were estimated anew")
+        return CheckedNormals(estimated, "were not normal to the surface and were estimated anew", is_estimated=True)
     missing = "" if is_given.all() else f"were missing at {np.count_nonzero(~is_given)} points and were estimated there"
     probes = WindingProbes.of(points, point_areas(points))
     one_sided = given * np.where(along < 0, -1.0, 1.0)[:, None]

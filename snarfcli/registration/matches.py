@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from snarfcli.registration.body_surface import BodyState, BodySurface, PosedSurface
 from snarfcli.registration.scan_points import ScanPoints, with_normals
 
-__all__ = ["ALL_DIRECTIONS", "Agreement", "Matches", "agreement", "match", "outside_clothes"]
+__all__ = ["ALL_DIRECTIONS", "Agreement", "Matches", "agreement", "match", "outside_clothes", "with_matches_by_place"]
 
 Array = NDArray[np.float64]
 
@@ -91,6 +91,13 @@ def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints, *, cloth
         of_scan=distance[count:],
         partners=matches.body[count:],
     )
+
+
+def with_matches_by_place(found: Agreement, surface: BodySurface, state: BodyState, scan: ScanPoints) -> Agreement:
+    """Return an agreement whose matches are the closest ones, whatever the normals, which at thin parts cannot be estimated."""
+    points = surface.posed(state).points
+    of_scan, partners = KDTree(points).query(scan.points[:_SCAN_POINTS])
+    return replace(found, of_body=KDTree(scan.points).query(points)[0], of_scan=of_scan, partners=partners)
 
 
 def match(posed: PosedSurface, scan: ScanPoints) -> Matches:

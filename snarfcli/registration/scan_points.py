@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from snarfcli.point_clouds import bone_normals
 from snarfcli.registration.scan_border import find_border
 
 __all__ = ["NORMALS_M", "ScanPoints", "with_normals"]
@@ -30,19 +32,34 @@ class ScanPoints:
     """[P, 3], unit length, outward."""
     whole: ScanPoints | None = None
     """The scan that these points are a part of, if it has more."""
+    is_estimated: bool = False
+    """Whether the normals are estimated by the points alone, so that some may point inward."""
 
     @classmethod
-    def sampled(cls, points: Array, normals: Array, count: int, seed: int = 0) -> ScanPoints:
+    def sampled(cls, points: Array, normals: Array, count: int, seed: int = 0, *, is_estimated: bool = False) -> ScanPoints:
         """Return at most `count` of the points, by chance; the same seed gives the same points."""
         order = np.random.default_rng(seed).permutation(len(points))[:count]
-        return cls(np.asarray(points, np.float64)[order], np.asarray(normals, np.float64)[order])
+        points, normals = np.asarray(points, np.float64)[order], np.asarray(normals, np.float64)[order]
+        return cls(points, normals, is_estimated=is_estimated)
 
     def __len__(self) -> int:
         return len(self.points)
 
     def first(self, count: int) -> ScanPoints:
         """Return the first of the points; they still know where the whole scan has its border."""
-        return ScanPoints(self.points[:count], self.normals[:count], self if self.whole is None else self.whole)
+        whole = self if self.whole is None else self.whole
+        return ScanPoints(self.points[:count], self.normals[:count], whole, self.is_estimated)
+
+    def sided_by(self, joints: Array, parents: Sequence[int]) -> ScanPoints:
+        """Return the points with normals that point away from the bones, if they are estimated; else unchanged.
+
+        Args:
+            joints: [J, 3], inside the surface, metres.
+            parents: J parents, -1 for a root.
+        """
+        if not self.is_estimated:
+            return self
+        return ScanPoints(self.points, bone_normals(self.points, joints, parents), is_estimated=True)
 
     @cached_property
     def features(self) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from snarfcli.registration.body_surface import BodyState, BodySurface
 from snarfcli.registration.fit_progress import FrameProgress
 from snarfcli.registration.fitted_sequence import Finder, FittedSequence, Found, Scans
-from snarfcli.registration.matches import Agreement, agreement
+from snarfcli.registration.matches import Agreement, agreement, with_matches_by_place
 from snarfcli.registration.scan_points import ScanPoints
 from snarfcli.registration.shape import different_frames, fit_shape
 from snarfcli.registration.solver import PosePrior, fit_state, scales
@@ -219,10 +219,17 @@ class _Tracker:
         self.progress.start_last()
         states, agreements, apart = [], [], []
         for index in range(len(self.scans)):
-            scan = self.scan(index)
-            state = fit_state(self.surface, self._state(index), scan, _POLISH_M, self.prior, clothes_m=self.clothes_m)
+            state = self._state(index)
+            scan = self.scan(index).sided_by(self.surface.joints(state), self.surface.parents)
+            if scan.is_estimated:
+                state = fit_state(self.coarse, state, scan, _WIDE_M, self.prior, clothes_m=self.clothes_m)
+                scan = scan.sided_by(self.surface.joints(state), self.surface.parents)
+            state = fit_state(self.surface, state, scan, _POLISH_M, self.prior, clothes_m=self.clothes_m)
             states.append(state)
-            agreements.append(agreement(self.surface, state, scan, clothes_m=self.clothes_m))
+            found = agreement(self.surface, state, scan, clothes_m=self.clothes_m)
+            if scan.is_estimated:
+                found = with_matches_by_place(found, self.surface, state, scan)
+            agreements.append(found)
             apart.append(apart_share(agreements[-1], self.surface.points_rest, scan.points, self.clothes_m))
             self.progress.add(1)
         self.progress.finish()

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
+from snarfcli.point_clouds import point_areas
 from snarfcli.registration.body_surface import BodySurface
 from snarfcli.registration.matches import Agreement
 
@@ -22,9 +23,9 @@ _POINT_SPACINGS, _VERTEX_SPACINGS = 3.0, 1.6  # if this is also that many times 
 # clothes, 17 to 21 % beside a floor and 7 % of the vertices with missing parts, but never both. An arm has 8 % of a body.
 _MOST_APART = 0.025
 _MOST_LOST = 0.5  # share of the frames that are apart, from which on the others of the sequence cannot be trusted either
-# Share of the points that a joint should have by its share of the surface: 0 to 0.34 for limbs that are cut off, which the body
-# may then hide in itself, and at least 0.44 (a hand at the chest) for those that are there; with 4,000 points.
-_UNSEEN = 0.35
+# Share of the points that a joint should have by its share of the surface: 0 to 0.36 for limbs that are cut off, which the body
+# may then hide in itself; for what is there above 0.9 at most joints, and at least 0.37 at a hand at the chest.
+_UNSEEN, _LEAST_POINTS = 0.35, 5  # that it should have, to tell that it has too few
 _MEASURED = 500  # points from which the next one is searched
 _WINDOW = 61  # frames around one among which its misfit is judged
 _JUMP_M = 0.15  # of a joint, between a frame and the middle of its neighbours
@@ -62,11 +63,12 @@ def unseen_joints(partners: NDArray[np.intp], surface: BodySurface) -> NDArray[n
 
     Args:
         partners: [M], number of the closest vertex of each point, as in `Agreement`.
-        surface: the body, K vertices spread evenly.
+        surface: the body.
     """
-    vertices = np.bincount(surface.bones, minlength=surface.num_joints) @ surface.follows / len(surface.bones)
+    areas = point_areas(surface.points_rest)
+    area = np.bincount(surface.bones, areas, surface.num_joints) @ surface.follows / areas.sum()
     points = np.bincount(surface.bones[partners], minlength=surface.num_joints) @ surface.follows / len(partners)
-    return points < _UNSEEN * vertices
+    return (points < _UNSEEN * area) & (area * len(partners) >= _LEAST_POINTS)
 
 
 def _spacing_m(points: Array) -> float:

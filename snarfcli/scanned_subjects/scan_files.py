@@ -16,7 +16,7 @@ from snarfcli.files import file_digest
 from snarfcli.point_clouds import PointFile, estimate_normals, read_frame
 from snarfcli.sampling.surface import oriented_surface_samples
 
-__all__ = ["FEWEST_POINTS", "ScanFacts", "examine_files", "fingerprint", "read_scan", "topology_of"]
+__all__ = ["FEWEST_POINTS", "OrientedScan", "ScanFacts", "examine_files", "fingerprint", "read_scan", "topology_of"]
 
 Array = NDArray[np.float64]
 
@@ -36,8 +36,22 @@ class ScanFacts:
     """Digest of the content of the file; empty if it cannot be read."""
 
 
-def read_scan(path: Path, count: int, seed: int, *, check_normals: bool = False) -> tuple[Array, Array, str]:
-    """Return points [P, 3] and unit normals [P, 3] of a scan, units and axes of the file, and what was wrong with its normals.
+@dataclass(frozen=True)
+class OrientedScan:
+    """The points of a file with normals, units and axes of the file."""
+
+    points: Array
+    """[P, 3]."""
+    normals: Array
+    """[P, 3], unit length."""
+    change: str = ""
+    """What was wrong with the normals, for messages; empty if nothing was."""
+    is_estimated: bool = False
+    """Whether the normals are estimated from the points."""
+
+
+def read_scan(path: Path, count: int, seed: int, *, check_normals: bool = False) -> OrientedScan:
+    """Return points on a mesh, or of a point cloud.
 
     Args:
         path: the file.
@@ -52,16 +66,16 @@ def read_scan(path: Path, count: int, seed: int, *, check_normals: bool = False)
     frame = read_frame(path)
     draws = np.random.default_rng([seed, 1])
     if not isinstance(frame, PointFile):
-        return *oriented_surface_samples(*frame, count, draws), ""
+        return OrientedScan(*oriented_surface_samples(*frame, count, draws))
     chosen = draws.permutation(len(frame.points))[:count]
     points = frame.points[chosen]
     if frame.normals is None:
-        return points, estimate_normals(points), ""
+        return OrientedScan(points, estimate_normals(points), is_estimated=True)
     normals = np.nan_to_num(frame.normals[chosen], posinf=0.0, neginf=0.0)
     if check_normals:
         checked = point_clouds.check_normals(points, normals)
-        return points, checked.normals, checked.change
-    return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12), ""
+        return OrientedScan(points, checked.normals, checked.change, checked.is_estimated)
+    return OrientedScan(points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
 def examine_files(paths: Sequence[Path]) -> Iterator[ScanFacts]:

@@ -78,13 +78,15 @@ class ScanSequence:
         """
         path = self.paths[index]
         count = min(_MOST_POINTS, round(self.count * _SPARE / self.share)) if self.share < 1 else self.count
-        points, normals, _ = read_scan(path, count, self.seed + index, check_normals=self.checks_normals)
+        scan = read_scan(path, count, self.seed + index, check_normals=self.checks_normals)
+        points, normals = scan.points, scan.normals
         subject = without_surroundings(points, normals, self.floor, has_parts=self.has_parts)
         if len(subject[0]) >= _SOMEBODY:  # else the subject is not in this frame, which its residual will show
             points, normals = subject
         if _is_inside_out(points, normals):
             normals = -normals
-        return ScanPoints.sampled(self.world.points(points), normals @ self.world.turn.T, self.count, self.seed + index)
+        points, normals = self.world.points(points), normals @ self.world.turn.T
+        return ScanPoints.sampled(points, normals, self.count, self.seed + index, is_estimated=scan.is_estimated)
 
     def vertices(self, index: int) -> Array:
         """Return the vertices [V, 3] of the mesh of one frame, metres, y up, with all that it shows.

@@ -143,5 +143,5 @@ def _samples(folders: Sequence[ScanFolder], facts: Sequence[Sequence[ScanFacts]]
         some = np.unique(np.linspace(0, len(usable) - 1, each).round().astype(int)) if usable else []
         for frame in (usable[index] for index in some):
             scan = read_scan(folder.paths[frame], options.points_per_frame, options.seed + frame, check_normals=True)
-            samples.append(Sample(number, frame, *scan))
+            samples.append(Sample(number, frame, scan.points, scan.normals, scan.change))
     return samples

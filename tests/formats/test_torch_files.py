@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from estimates import rezipped, saved
-from fuzz_targets import _like_joblib
+from fuzz_motion_targets import like_joblib
 
 from snarfcli.errors import UserError
 from snarfcli.formats.pickle_tree import Unknown
@@ -63,7 +63,7 @@ def test_tensors_in_plain_pickles(tmp_path, protocol):
 def test_what_joblib_writes(tmp_path):
     array = np.arange(6.0).reshape(2, 3)
     path = tmp_path / "a.pkl"
-    for data in (_like_joblib(array), zlib.compress(_like_joblib(array))):
+    for data in (like_joblib(array), zlib.compress(like_joblib(array))):
         path.write_bytes(data)
         np.testing.assert_array_equal(read_estimate(path)[0]["poses"], array)
     joblib = pytest.importorskip("joblib", reason="joblib is only an option of the project")

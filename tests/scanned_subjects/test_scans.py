@@ -89,7 +89,7 @@ def test_point_clouds_get_normals_where_they_have_none_or_wrong_ones(tmp_path):
     write_arrays(tmp_path / "poses.npz", {"poses": np.zeros((3, 24, 3))})  # is no scan
     paths = tuple(frame_files(tmp_path))
     assert [path.name for path in paths] == ["0.npz", "1.npz", "2.npz"]
-    assert [read_scan(path, 1500, 0, check_normals=True)[2] for path in paths] == [
+    assert [read_scan(path, 1500, 0, check_normals=True).change for path in paths] == [
         "", "", "pointed to both sides and were turned outward"
     ]  # fmt: skip
     scans = ScanSequence(paths, FileToWorld(1, "y"), 1500, checks_normals=True)

@@ -11,6 +11,7 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from snarfcli.commands.doctor_findings import Finding, promises
 from snarfcli.commands.doctor_tools import TOOLS, describe_error, extras, package_finding, tools
 from snarfcli.datasets.settings import DataConfig, command_settings
 from snarfcli.errors import UserError
+from snarfcli.extras import why_not_imported
 from snarfcli.parallel import count_cores
 from snarfcli.texts import counted
 from snarfcli.versions import RECORDED_PACKAGES
@@ -178,7 +180,7 @@ def _versions() -> Iterator[Finding]:
     yield Finding("snarf", f"{snarfcli.__version__}, {Path(snarfcli.__file__).parent}")
     yield Finding("python", f"{platform.python_version()}, {sys.executable}")
     yield Finding("platform", f"{platform.platform()}, {platform.machine()}")
-    yield package_finding("torch", "torch", "torch")
+    yield package_finding("torch", "torch", partial(why_not_imported, "torch", "torch"))
     for package in (*RECORDED_PACKAGES, *_OTHER_PACKAGES):
         if package not in ("snarf", "torch", *TOOLS):
             yield package_finding(package, package)

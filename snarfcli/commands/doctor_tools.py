@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 from snarfcli.commands.doctor_findings import Finding
+from snarfcli.extras import why_not_imported
+from snarfcli.extras.meshlab import MESHLAB_NEEDS, why_no_meshlab
 from snarfcli.texts import one_line
 from snarfcli.versions import installed_version
 
 __all__ = ["EXTRAS", "TOOLS", "describe_error", "extras", "package_finding", "tools"]
 
-TOOLS = {"embreex": "embreex.rtcore_scene", "libigl": "igl", "pymeshlab": "pymeshlab"}
-"""Compiled packages that are imported to see whether they work, and the module that shows it."""
+TOOLS: dict[str, Callable[[], str | None]] = {
+    "embreex": partial(why_not_imported, "embreex", "embreex.rtcore_scene"),
+    "libigl": partial(why_not_imported, "libigl", "igl"),
+    "pymeshlab": why_no_meshlab,
+}
+"""Compiled packages, and what says why one cannot be used."""
 _INSTEAD = {
     "embreex": "libigl traces the rays, several times slower; there are no wheels for Linux on ARM",
     "pymeshlab": "snarf spreads the surface points (poisson=own) and libigl decimates; data=clothed needs it",
 }
 """What is used where a package is missing."""
+_NEEDS = {"pymeshlab": MESHLAB_NEEDS}
 _LICENCES = {"pymeshlab": "licence GPL-3; can be left out: poisson=own, and libigl decimates"}
 
 EXTRAS = {
@@ -33,8 +40,8 @@ EXTRAS = {
 def tools() -> Iterator[Finding]:
     """Yield ffmpeg and the compiled packages."""
     yield _ffmpeg()
-    for package, module in TOOLS.items():
-        yield package_finding("embree" if package == "embreex" else package, package, module)
+    for package, why_not in TOOLS.items():
+        yield package_finding("embree" if package == "embreex" else package, package, why_not)
 
 
 def extras() -> Iterator[Finding]:
@@ -45,18 +52,19 @@ def extras() -> Iterator[Finding]:
         yield Finding(extra, missing if installed is None else f"{package} {installed}, for {purpose}")
 
 
-def package_finding(name: str, package: str, module: str | None = None) -> Finding:
-    """Return the version of a package and, if `module` is given, whether that module can be imported."""
+def package_finding(name: str, package: str, why_not: Callable[[], str | None] | None = None) -> Finding:
+    """Return the version of a package and, if `why_not` is given, which says why it cannot be used, whether it can."""
     installed = installed_version(package)
     instead = f"; {_INSTEAD[package]}" if package in _INSTEAD else ""
     if installed is None:
         return Finding(name, f'not installed{instead}; run "pip install {package}"', is_fallback=True)
     try:
-        if module is not None:
-            importlib.import_module(module)
+        reason = why_not() if why_not is not None else None
     except Exception as error:
-        text = f"{package} {installed} cannot be imported: {describe_error(error)}{instead}"
-        return Finding(name, text, is_fallback=True)
+        reason = describe_error(error)
+    if reason is not None:
+        needs = f"; {_NEEDS[package]}" if package in _NEEDS else ""
+        return Finding(name, f"{installed} cannot be used: {reason}{instead}{needs}", is_fallback=True)
     licence = f" ({_LICENCES[package]})" if package in _LICENCES else ""
     return Finding(name, f"{package} {installed}{licence}" if name != package else f"{installed}{licence}")
 

@@ -41,7 +41,7 @@ class PreprocessConfig:
     inside_test: str = MISSING
     """Test for inside points: winding (points in overlapping parts are inside) or parity (outside, as in the papers' code)."""
     poisson: str = MISSING
-    """What spreads points over the surface: pymeshlab (licence GPL-3), own, or auto for pymeshlab if it is installed."""
+    """What spreads points over the surface: pymeshlab (licence GPL-3), own, or auto for pymeshlab if it can be used."""
     workers: int = MISSING
     """Number of worker processes; 0 for one per core."""
     seed: int = MISSING

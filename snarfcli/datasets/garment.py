@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import KDTree
 
 from snarfcli.errors import UserError
+from snarfcli.extras.meshlab import INSTALL_MESHLAB, why_no_meshlab
 from snarfcli.sampling import winding_numbers
 from snarfcli.sampling.occupancy import count_boundary_edges
 
@@ -160,15 +161,12 @@ def _union(one: tuple[NDArray, NDArray], other: tuple[NDArray, NDArray]) -> tupl
     """Return the outer surface of two closed meshes.
 
     Raises:
-        UserError: MeshLab is not installed.
+        UserError: MeshLab cannot be used.
     """
-    try:
-        import pymeshlab  # here, since it takes a second to import
-    except ModuleNotFoundError:
-        raise UserError(
-            "data=clothed joins body and garment with MeshLab, but pymeshlab is not installed; install it with: "
-            "pip install pymeshlab (licence GPL-3)"
-        ) from None
+    reason = why_no_meshlab()
+    if reason is not None:
+        raise UserError(f"data=clothed joins body and garment with MeshLab, but {reason}; install it with: {INSTALL_MESHLAB}")
+    import pymeshlab
 
     meshes = pymeshlab.MeshSet(verbose=False)  # pyright: ignore[reportAttributeAccessIssue]  # its stub lists no classes
     for vertices, faces in (one, other):

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import igl
 import numpy as np
 
-from snarfcli.texts import one_line
+from snarfcli.extras import why_not_imported
 
 __all__ = ["NO_HIT", "FirstHits", "RayMesh", "count_crossings", "ray_mesh", "why_no_embree"]
 
@@ -45,14 +45,7 @@ class RayMesh(Protocol):
 @cache
 def why_no_embree() -> str | None:
     """Return why Embree is not used, as one line; None if it is."""
-    try:
-        import embreex.mesh_construction
-        import embreex.rtcore_scene  # noqa: F401
-    except ModuleNotFoundError as error:
-        return "embreex is not installed" if (error.name or "").partition(".")[0] == "embreex" else one_line(error, 200)
-    except ImportError as error:  # a wheel for another system, or a missing library
-        return f"embreex cannot be imported: {one_line(error, 200)}"
-    return None
+    return why_not_imported("embreex", "embreex.mesh_construction", "embreex.rtcore_scene")
 
 
 def ray_mesh(vertices: np.ndarray, faces: np.ndarray) -> RayMesh:

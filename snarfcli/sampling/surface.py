@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 
 import numpy as np
 
 from snarfcli.errors import UserError, nearest
+from snarfcli.extras.meshlab import INSTALL_MESHLAB, why_no_meshlab
 from snarfcli.sampling.disks import poisson_disks
 from snarfcli.sampling.triangles import area_normals, random_points_in, uniform_in_triangles
 
@@ -29,24 +29,23 @@ def choose_poisson(choice: str) -> str:
     """Return the program that draws Poisson-disk samples, one of `POISSON`.
 
     Args:
-        choice: one of them, or auto: MeshLab if it is installed. A line in the log says so if it is not.
+        choice: one of them, or auto: MeshLab if it can be used. A line in the log says why if it cannot.
 
     Raises:
-        UserError: it is none of these, or not installed.
+        UserError: it is none of these, or cannot be used.
     """
     if choice not in ("auto", *POISSON):
         wanted = ", ".join(("auto", *POISSON))
         raise UserError(f"poisson: wanted one of {wanted}, got {choice!r}{nearest(choice, ('auto', *POISSON))}")
-    is_installed = importlib.util.find_spec("pymeshlab") is not None
-    if choice == "pymeshlab" and not is_installed:
-        raise UserError(
-            "poisson: wanted MeshLab, but pymeshlab is not installed; give poisson=own, or install it with: "
-            "pip install pymeshlab (licence GPL-3)"
-        )
-    if choice == "auto" and not is_installed:
-        log.info("surface points are spread by snarf's own code, since pymeshlab is not installed (poisson=own)")
-        return "own"
-    return "pymeshlab" if choice == "auto" else choice
+    if choice == "own":
+        return choice
+    reason = why_no_meshlab()
+    if reason is None:
+        return "pymeshlab"
+    if choice == "pymeshlab":
+        raise UserError(f"poisson: wanted MeshLab, but {reason}; give poisson=own, or install it with: {INSTALL_MESHLAB}")
+    log.info("surface points are spread by snarf's own code, since %s (poisson=own)", reason)
+    return "own"
 
 
 def surface_samples(

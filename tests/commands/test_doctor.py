@@ -146,7 +146,7 @@ def test_it_runs_without_pytorch(tmp_path):
     code = "import sys; sys.modules['torch'] = None; from snarfcli.cli.main import main; raise SystemExit(main(['doctor']))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "cannot be imported" in done.stdout
+    assert "cannot be used: torch is not installed" in done.stdout
     assert "libigl" in done.stdout
     assert "Traceback" not in done.stdout + done.stderr
 

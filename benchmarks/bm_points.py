@@ -3,7 +3,7 @@
     python benchmarks/bm_points.py                 about ten minutes on one core
 
 Points are drawn on six poses of built-in subjects, with and without 5 mm of noise. Normals are true, or their sides are those
-that the bones say, as in `snarf preprocess`, or those that the points themselves say, as in `snarf fit`. The
+that the bones say, as in `snarf preprocess`, or those that the points themselves say, as at the start of `snarf fit`. The
 IoU is that of 60,000 points in a box around the mesh, and of 20,000 points near its surface (1 cm of normal noise).
 """
 
@@ -104,8 +104,9 @@ def measure(method: str, count: int, noise_m: float) -> NDArray[np.float64]:
         low, high = mesh[0].min(axis=0) - 0.05, mesh[0].max(axis=0) + 0.05
         near = oriented_surface_samples(*mesh, 20_000, draws)[0]
         places = (low + (high - low) * draws.random((60_000, 3)), near + 0.01 * draws.standard_normal(near.shape))
+        scan = Scan(points, normals, joints_of(data, spec, frame), data.skeleton.parents)
         start = time.process_time()
-        inside = METHODS[method](Scan(points, normals, joints_of(data, spec, frame), data.skeleton.parents))
+        inside = METHODS[method](scan)
         seconds = time.process_time() - start
         pairs = [(inside(at), surface_test(*mesh)(at)) for at in places]
         rows.append([seconds, *((one & other).sum() / (one | other).sum() for one, other in pairs)])

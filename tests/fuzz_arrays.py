@@ -44,7 +44,8 @@ def odd_npz(rng: random.Random, content: bytes) -> bytes:
         else:
             other = rng.choice(
                 ["poses", "pose", "trans", "smpl_scaling", "fps", "root_orient", "pose_body", "smpl_poses", "body_pose", "up",
-                 "global_orient", "pose_world", "left_hand_pose", "Rh", "Th", "pred_cam_t", "results", "pred_global_rots"]
+                 "global_orient", "pose_world", "left_hand_pose", "rest_up", "metres_per_unit",
+                 "Rh", "Th", "pred_cam_t", "results", "pred_global_rots"]
             )  # fmt: skip
             arrays[other] = array
             continue

@@ -137,8 +137,8 @@ is plain Python without a wheel, and pip builds it on any machine. snarf itself 
 without its library.
 
 pymeshlab (licence GPL-3) has wheels for Linux with glibc 2.35 (Ubuntu 22.04, Debian 12) and newer. On older systems, such
-as RHEL 8 and 9, `pip install '.[commands-without-gpl]'` leaves it out; only `data=clothed` needs it. It also needs
-`libGL.so.1` and `libOpenGL.so.0` (Debian and Ubuntu: `apt install libgl1 libopengl0`); without them it is left aside.
+as RHEL 8 and 9, `pip install '.[commands-without-gpl]'` leaves it out; only `data=clothed` needs it. pymeshlab also needs
+`libGL.so.1` and `libOpenGL.so.0` (Debian and Ubuntu: `apt install libgl1 libopengl0`); without them it is not used.
 embreex has no wheels for Linux and Windows on ARM; there libigl traces the rays, four times slower.
 
 The tests have been run on Linux x86-64 with Python 3.11, and parts of them with Python 3.10 and the oldest allowed packages

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,7 +34,11 @@ def instead_of_flag(command: Command, argument: str, rest: Sequence[str], flags:
     flag, equals, value = argument.partition("=")
     name = flag.lstrip("-").replace("-", "_")
     schema = _schema(command)
-    found = name if name in schema.texts else next((f"{group}.{name}" for group in _groups_with(schema, name)), None)
+    group, _, nested = name.partition(".")
+    if name in schema.texts or (group in schema.groups and nested in schema.groups[group].texts):
+        found = name
+    else:
+        found = next((f"{group}.{name}" for group in _groups_with(schema, name)), None)
     if found is None:
         return nearest(argument, flags)
     if not equals:
@@ -56,7 +61,7 @@ def instead_of_argument(command: Command, argument: str) -> str:
     if path.suffix.lower() in _RIGGED and "pose" not in schema.texts and {"data", "subject"} <= schema.texts.keys():
         folder = _setting("data.folder", str(path.parent))
         return f"; for a rigged file, write data=meshes {folder} {_setting('subject', path.stem)}"
-    if "--pose" in command.flags and path.exists():
+    if "--pose" in command.flags and os.path.exists(argument):
         return f"; for a motion file, write --pose {shlex.quote(one_line(argument, _LONGEST))}"
     return ""
 

@@ -30,8 +30,8 @@ _LICENCES = {"pymeshlab": "licence GPL-3; can be left out: poisson=own, and libi
 EXTRAS = {
     "view": ("viser", "snarf view"),
     "hub": ("huggingface-hub", "avatars of the Hugging Face Hub, Avatar.from_pretrained"),
-    "blender": ("bpy", "snarf export format=fbx and usd; a blender on the PATH serves too"),
-    "joblib": ("hydra-joblib-launcher", "several runs at a time, launcher=joblib"),
+    "blender": ("bpy", "snarf export format=fbx and usd, unless a blender is on the PATH"),
+    "joblib": ("hydra-joblib-launcher", "several runs at a time, hydra/launcher=joblib"),
     "submitit": ("hydra-submitit-launcher", "runs on a cluster, launcher=submitit_slurm"),
 }
 """Extras of single functions: the package that each brings, and what needs it."""

@@ -67,7 +67,10 @@ def check_place(config: ExportConfig, output: Path) -> Path:
     if config.format in MESH_WRITERS:
         return check_folder(output, config.overwrite)
     if config.format == "pretrained":
-        return check_folder(output, _may_replace(config, output), _PRETRAINED)
+        overwrite = _may_replace(config, output)
+        place = check_folder(output, overwrite, _PRETRAINED)
+        check_output(record_file(config, place), overwrite)
+        return place
     suffix = output.suffix.lower().lstrip(".")
     if suffix != config.format:
         hint = f"give format={suffix}, or " if suffix in FORMATS and suffix not in FOLDER_FORMATS else ""
@@ -79,7 +82,7 @@ def check_place(config: ExportConfig, output: Path) -> Path:
 
 
 def record_file(config: ExportConfig, output: Path) -> Path:
-    """Return the file of the record: in the folder of meshes, or beside the output, as what is passed on names no paths."""
+    """Return the file of the record: in the folder of meshes, or beside the output: it names paths, and is not passed on."""
     if config.format in MESH_WRITERS:
         return output / _RECORD
     name = output.name if config.format == "pretrained" else f"{output.stem}_{output.suffix[1:]}"

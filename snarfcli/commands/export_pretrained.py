@@ -37,8 +37,8 @@ def write_folder(config: ExportConfig) -> int:
         facts = {"avatar": str(path), "folder": output.name, "bytes": size, "evaluations": list(shown)}
         write_record(config, output, {**facts, **machine_facts()})
     if shown:
-        log.info("the model card has the IoU %s", " and ".join(shown))
+        log.info("the model card contains the IoU %s", " and ".join(shown))
     else:
-        log.info('the model card has no evaluation: run "snarf eval" and "snarf eval --ood" before, for its numbers')
+        log.info('the model card has no evaluation: run "snarf eval" and "snarf eval --ood" first, to add them')
     log.info("%s: %.2f MB; Avatar.from_pretrained and ckpt=FOLDER read it", output, size / 1e6)
     return 0

@@ -25,7 +25,7 @@ def read_frame_surface(path: Path, joints: NDArray, parents: Sequence[int]) -> t
     Args:
         path: the file.
         joints: [J, 3], joints inside the surface in this frame, units and axes of the file; they say which side of points
-            without normals is outside.
+            without usable normals is outside.
         parents: J parents, -1 for a root.
 
     Raises:
@@ -39,8 +39,10 @@ def read_frame_surface(path: Path, joints: NDArray, parents: Sequence[int]) -> t
         chosen = np.random.default_rng(0).permutation(len(points))[:_MOST_POINTS]
         points, normals = points[chosen], None if normals is None else normals[chosen]
     try:
-        outward = bone_normals(points, joints, parents) if normals is None else check_normals(points, normals).normals
-        return close_surface(points, outward)
+        checked = None if normals is None else check_normals(points, normals)
+        if checked is None or checked.is_estimated:
+            return close_surface(points, bone_normals(points, joints, parents))
+        return close_surface(points, checked.normals)
     except ValueError as error:
         raise UserError(f"no surface can be closed around the points of {path} ({error}); leave this frame out") from None
 

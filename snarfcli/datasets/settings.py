@@ -47,6 +47,9 @@ class DataConfig:
 def command_settings(data: DataConfig, subject: str, data_root: str) -> str:
     """Return the settings that name a subject on a command line, for messages that say what to do next."""
     words = [f"data={data.name}", f"subject={subject}"]
-    words += [f"data.folder={data.folder}"] if data.folder else []
+    usual = DataConfig()
+    for name in ("folder", "scale", "up", "canonical", "untrusted"):
+        if (value := getattr(data, name)) != getattr(usual, name):
+            words.append(f"data.{name}={str(value).lower() if isinstance(value, bool) else value}")
     words += [f"data_root={data_root}"] if data_root != _USUAL_ROOT else []
     return shlex.join(words)

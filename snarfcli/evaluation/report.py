@@ -105,9 +105,10 @@ def table(evaluation: EvaluationReport) -> str:
             f"{100 * means['iou_tight_box']:6.2f}"
         )
     lines.append(_row("all frames", overall, width))
-    lines.append(
-        "bbox: the papers' cube; surface: near the surface; tight: the mesh's own box; worst: lowest surface IoU of a frame"
-    )
+    lines += [
+        "bbox: the papers' cube; surface: near the surface; tight: the mesh's own box;",
+        "worst: lowest surface IoU of a frame",
+    ]
     return "\n".join(lines)
 
 

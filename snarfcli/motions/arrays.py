@@ -62,8 +62,12 @@ def motion_from_arrays(arrays: PoseSet, skeleton: Skeleton, path: Path, *, name:
     has_place = translation is not None
     translation = np.zeros((frames, 3)) if translation is None else translation
     root_rest = skeleton.joints_rest[0].detach().cpu().double().numpy()
-    if up == "auto" and "rest_up" in arrays.found:
-        turn = y_from_up(_declared_up(arrays, "rest_up"))  # of all that has axes: the rest pose is then that of the skeleton
+    if "rest_up" in arrays.found:
+        declared = _declared_up(arrays, "rest_up")
+        if declared == "auto" or up not in ("auto", declared):
+            wanted = f"up={declared}, as the file says" if declared != "auto" else f"rest_up: one of {', '.join(UPS[1:])}"
+            raise UserError(f"pose file {path}: wanted {wanted}, got another value; leave up out, or repair the file")
+        turn = y_from_up(declared)  # of all that has axes: the rest pose is then that of the skeleton
         poses = turn.apply(poses.reshape(-1, 3)).reshape(poses.shape)
         return Motion(name, poses, turn.apply(translation), frame_rate_of(arrays, path))
     if "placed_rotation" in arrays.found and "placed_translation" in arrays.found:

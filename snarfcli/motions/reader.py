@@ -87,7 +87,8 @@ def read_motion(
             first clip, or the first person in the world.
 
     Returns:
-        The motion in a world with y up, facing as in the file, named after the file, or after the folder of a `poses.npz`.
+        The motion in a world with y up, facing as in the file. Its name is that of the file, or of the folder around a file
+        that is called poses or motion.
 
     Raises:
         UserError: the file is missing, of another kind, damaged, or does not fit the skeleton; the message says why.
@@ -144,10 +145,10 @@ def read_motion_and_source(
 
 
 def motion_name(path: Path) -> str:
-    """Return the name of the motion in a file or folder: for a `poses.npz` or `motion.bvh`, that of the folder around it."""
+    """Return the name of the motion in a file or folder; if all files of its kind are called poses or motion, the folder's."""
     if path.is_dir():
         return path.name
-    return path.absolute().parent.name or path.stem if path.stem in _SAME_NAMES else path.stem
+    return (path.absolute().parent.name or path.stem) if path.stem in _SAME_NAMES else path.stem
 
 
 def average_skeleton() -> Skeleton:

@@ -22,15 +22,15 @@ _PLANE_NEIGHBOURS = 14
 _BEYOND = 0.7  # length of what follows the last joint of a limb, in that of the bone before: hands, toes, the top of the head
 _RADIUS, _RADII = 0.05, (0.01, 0.12)  # first guess and limits of a limb's radius, in the longest side of the skeleton
 _ROUNDS = 4  # of finding which points belong to a bone, and from these its radius
-_LEAST_POINTS = 6  # that a radius is found from
+_LEAST_POINTS = 6  # for a radius
 _POINTS_AT_ONCE = 2048
 
 
 def bone_normals(points: Array, joints: Array, parents: Sequence[int]) -> Array:
     """Return unit normals [N, 3] that point away from the bones.
 
-    A point belongs to the bone that is closest in radii of its limb, so that the trunk beside an arm is not the arm's.
-    The radius is the median distance of the points that belong to the bone.
+    A point belongs to the bone that is closest relative to the radius of its limb, so that the trunk beside an arm is not the
+    arm's. The radius is the median distance of the points that belong to the bone.
 
     Args:
         points: [N, 3], on the surface around the bones, any unit.

@@ -44,7 +44,7 @@ class CheckedNormals:
     change: str
     """What was changed, for messages, such as "pointed inward and were turned"; empty if nothing was."""
     is_estimated: bool = False
-    """Whether they were given up, and estimated by the points alone."""
+    """Whether the given ones could not be used, and were replaced by estimates from the points."""
 
 
 def estimate_normals(points: Array) -> Array:

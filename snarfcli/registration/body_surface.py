@@ -15,6 +15,7 @@ from torch import Tensor
 
 from snarfcli.bodies import Body, Skeleton
 from snarfcli.meshing.mesh import vertex_normals
+from snarfcli.point_clouds import LEAST_POINTS, point_areas
 from snarfcli.registration.kinematics import kinematics
 from snarfcli.registration.rotations import matrix_to_vector, project_to_rotations, vector_to_matrix
 
@@ -197,6 +198,13 @@ class BodySurface:
     def bones(self) -> NDArray[np.intp]:
         """[K], the joint that moves each point most."""
         return self.weights.argmax(1)
+
+    @cached_property
+    def bone_areas(self) -> Array:
+        """[J], share of the surface in the rest pose that moves with each joint and those that follow it."""
+        few = len(self.points_rest) < LEAST_POINTS
+        areas = np.ones(len(self.points_rest)) if few else point_areas(self.points_rest)
+        return np.bincount(self.bones, areas, self.num_joints) @ self.follows / areas.sum()
 
     @cached_property
     def shares(self) -> Array:

@@ -94,10 +94,15 @@ def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints, *, cloth
 
 
 def with_matches_by_place(found: Agreement, surface: BodySurface, state: BodyState, scan: ScanPoints) -> Agreement:
-    """Return an agreement whose matches are the closest ones, whatever the normals, which at thin parts cannot be estimated."""
-    points = surface.posed(state).points
-    of_scan, partners = KDTree(points).query(scan.points[:_SCAN_POINTS])
-    return replace(found, of_body=KDTree(scan.points).query(points)[0], of_scan=of_scan, partners=partners)
+    """Return an agreement whose `of_body`, `of_scan` and `partners` are those of the closest places, whatever the normals.
+
+    At thin parts, normals cannot be estimated from points, so that matches by normals are far although the pose is right.
+    """
+    posed = surface.posed(state)
+    away, nearest = KDTree(scan.points).query(posed.points)
+    unseen = _unseen(posed, scan, posed.points - scan.points[nearest])
+    of_scan, partners = KDTree(posed.points).query(scan.points[:_SCAN_POINTS])
+    return replace(found, of_body=np.where(unseen, np.minimum(_UNSEEN_M, away), away), of_scan=of_scan, partners=partners)
 
 
 def match(posed: PosedSurface, scan: ScanPoints) -> Matches:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
-from snarfcli.point_clouds import point_areas
 from snarfcli.registration.body_surface import BodySurface
 from snarfcli.registration.matches import Agreement
 
@@ -25,7 +24,8 @@ _MOST_APART = 0.025
 _MOST_LOST = 0.5  # share of the frames that are apart, from which on the others of the sequence cannot be trusted either
 # Share of the points that a joint should have by its share of the surface: 0 to 0.36 for limbs that are cut off, which the body
 # may then hide in itself; for what is there above 0.9 at most joints, and at least 0.37 at a hand at the chest.
-_UNSEEN, _LEAST_POINTS = 0.35, 5  # that it should have, to tell that it has too few
+_UNSEEN = 0.35
+_LEAST_POINTS = 5  # expected points, below which nothing is said
 _MEASURED = 500  # points from which the next one is searched
 _WINDOW = 61  # frames around one among which its misfit is judged
 _JUMP_M = 0.15  # of a joint, between a frame and the middle of its neighbours
@@ -59,14 +59,13 @@ def apart_share(found: Agreement, vertices: Array, points: Array, clothes_m: flo
 
 
 def unseen_joints(partners: NDArray[np.intp], surface: BodySurface) -> NDArray[np.bool_]:
-    """Return the joints [J] that the scan does not show: they and those that follow them have far less points than they should.
+    """Return the joints [J] that the scan does not show: with those that follow them, they have far too few points.
 
     Args:
         partners: [M], number of the closest vertex of each point, as in `Agreement`.
         surface: the body.
     """
-    areas = point_areas(surface.points_rest)
-    area = np.bincount(surface.bones, areas, surface.num_joints) @ surface.follows / areas.sum()
+    area = surface.bone_areas
     points = np.bincount(surface.bones[partners], minlength=surface.num_joints) @ surface.follows / len(partners)
     return (points < _UNSEEN * area) & (area * len(partners) >= _LEAST_POINTS)
 

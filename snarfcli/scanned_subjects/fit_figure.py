@@ -78,7 +78,8 @@ def _extremes(reports: Sequence[SequenceReport]) -> tuple[list[tuple[SequenceRep
     worst = pick(frames[::-1], _WORST_PARTS)
     taken = {(report.number, frame) for report, frame in worst}
     others = [one for one in frames if (one[1].number, one[2]) not in taken]
-    return worst, pick(others, -(-count // len(reports)))  # frames that fit well are often alike: few parts, far apart
+    best = pick(others, -(-count // len(reports)))  # frames that fit well are often alike: few parts, far apart
+    return worst, best[: len(worst)]
 
 
 def _draw(

@@ -53,8 +53,9 @@ class SequenceReport:
 
     @property
     def unseen_joints(self) -> list[str]:
-        """Names of the joints that are not seen in most frames; their rotations are only what is usual."""
-        return [self.joint_names[joint] for joint in np.flatnonzero(self.fitted.unseen.mean(0) > _MOSTLY)]
+        """Names of the joints that are not seen in most frames that are trusted; their rotations are only what is usual."""
+        unseen = self.fitted.unseen[self.fitted.is_trusted]
+        return [self.joint_names[joint] for joint in np.flatnonzero(unseen.sum(0) > _MOSTLY * len(unseen))]
 
     def residual_mm(self) -> tuple[float, float]:
         """Return the mean residual of the frames that can be read and the one that 95 % of them do not exceed, millimetres."""

@@ -44,7 +44,7 @@ def test_the_folder_has_the_avatar_and_its_evaluation(trained, capsys, caplog):
         assert export(capsys) == (0, "")
     assert sorted(path.name for path in FOLDER.iterdir()) == FILES
     assert "| in distribution | 60 | 98.0 | 93.1 |" in card()
-    assert "the model card has the IoU in distribution" in caplog.text
+    assert "the model card contains the IoU in distribution" in caplog.text
     pose, points = torch.zeros(1, 3, 3), torch.rand(1, 200, 3) * 2 - 1
     again = Avatar.from_pretrained(FOLDER)
     torch.testing.assert_close(again.occupancy(points, pose), trained.occupancy(points, pose), rtol=0, atol=0)
@@ -66,7 +66,7 @@ def test_without_an_evaluation_it_says_how_to_get_one(capsys, caplog):
     (RUN / "eval_id/metrics.json").write_text("{}")
     with caplog.at_level(logging.INFO):
         assert export(capsys, "pretrained.license=Ask me first.")[0] == 0
-    assert 'no evaluation: run "snarf eval" and "snarf eval --ood" before' in caplog.text
+    assert 'no evaluation: run "snarf eval" and "snarf eval --ood" first' in caplog.text
     assert caplog.text.count("since it is of another avatar") == 1
     assert "Not evaluated." in card()
     assert "Ask me first." in card()

@@ -49,7 +49,8 @@ handstand               1  100.00   100.00   95.50  100.00        0.00      0.00
 ---------------------------------------------------------------------------------
 mean of sequences           97.88    93.00   95.50
 all frames              3   97.17    90.67   95.50   85.00       26.67      0.667
-bbox: the papers' cube; surface: near the surface; tight: the mesh's own box; worst: lowest surface IoU of a frame"""
+bbox: the papers' cube; surface: near the surface; tight: the mesh's own box;
+worst: lowest surface IoU of a frame"""
     )
 
 

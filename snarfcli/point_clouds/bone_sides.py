@@ -1,8 +1,7 @@
 """The sides of the surface around a skeleton: normals point away from the bone that a point belongs to.
 
-Without a skeleton, sides must be told by the points alone (`normals.py`), which can fail for a whole limb. With the bones, the
-side is wrong for 2.7 % of 4,000 points on six poses of built-in subjects, mostly at fingers; for 3.2 % with 5 mm of noise, and
-for 4.0 % in the worst pose.
+Without a skeleton, sides must be told by the points alone (`normals.py`), which can fail for a whole limb. With the bones this
+does not happen (`benchmarks/bm_points.py`); some sides stay wrong at fingers and toes.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def agreement(surface: BodySurface, state: BodyState, scan: ScanPoints, *, cloth
 
 
 def with_matches_by_place(found: Agreement, surface: BodySurface, state: BodyState, scan: ScanPoints) -> Agreement:
-    """Return an agreement whose `of_body`, `of_scan` and `partners` are those of the closest places, whatever the normals.
+    """Return an agreement whose `of_body`, `of_scan` and `partners` are those of the closest places; normals do not count.
 
     At thin parts, normals cannot be estimated from points, so that matches by normals are far although the pose is right.
     """
